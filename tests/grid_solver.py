@@ -1,6 +1,6 @@
 """Dynamic programming on a grid, for two states and one control: an independent optimum under noise.
 
-V_n(x) = min over u of ∫ℓ + E V_{n+1}(F(x, u) + σ(x)ΔW), with cubic splines between the nodes of the grid, the mean over
+V_n(x) = min over u of ∫ℓ + E V_{n+1}(F(x, u) + σ(x)ΔW), with a risk θ (1/θ) log E exp(θV) in the place of E V. With cubic splines between the nodes of the grid, the mean over
 ΔW by three points for each source (exact to the fifth degree), and the minimum among given controls, refined by a
 parabola through the best and its neighbours.
 """
@@ -45,7 +45,7 @@ def solve_on_grid(
             first, second = (np.clip(np.asarray(x[..., i]), lower[i], upper[i]) for i in range(2))
             return spline.ev(first, second)
 
-        Q = np.asarray(paid) + sum(weight * later(mean + step) for step, weight in draws)
+        Q = np.asarray(paid) + _expected([(later(mean + step), weight) for step, weight in draws], problem.risk)
         value = _least(Q).reshape(points, points)
     final = RectBivariateSpline(*axes, value)
     return lambda x0: torch.tensor(final.ev(np.asarray(x0[..., 0]), np.asarray(x0[..., 1])))
@@ -60,6 +60,14 @@ def _draws(problem: Problem, x: Tensor) -> list[tuple[Tensor, float]]:
         w = math.sqrt(problem.horizon.dt) * torch.tensor([point for point, _ in combination], dtype=torch.float64)
         draws.append((problem.noise.displacement(x, w.expand(len(x), -1)), math.prod(p for _, p in combination)))
     return draws
+
+
+def _expected(values: list[tuple[Array, float]], risk: float) -> Array:
+    """Σ w v, or with a risk θ (1/θ) log Σ w exp(θv)."""
+    if not risk:
+        return np.asarray(sum(weight * value for value, weight in values))
+    most = np.max([value for value, _ in values], 0)
+    return most + np.log(sum(weight * np.exp(risk * (value - most)) for value, weight in values)) / risk
 
 
 def _least(Q: Array) -> Array:

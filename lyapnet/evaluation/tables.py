@@ -84,11 +84,23 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
         "… from costs alone, without V as a control variate": (
             _interval(noise["plain_mean"], noise["plain_half_width"])
         ),
+        **_risk_row(noise),
         f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(
             "infinite" if level is None else f"{level:.4g}" for level in levels.values()
         ),
+        **(
+            {"… mean of the dearest 5 %": measured_or_not("", noise["dearest_mean"])} if "dearest_mean" in noise else {}
+        ),
         "paths lost, which cost half more than V and not by their noise": f"{noise['lost_fraction']:.2%}",
     }
+
+
+def _risk_row(noise: dict[str, Any]) -> dict[str, str]:
+    """The row of the certainty equivalent in a task with risk."""
+    if not noise.get("risk"):  # since version 0.4
+        return {}
+    equivalent = _interval(noise["with_risk"], noise["with_risk_half_width"])
+    return {f"log E exp(θJ)/θ, θ = {noise['risk']:g}, with its 95 % interval": equivalent}
 
 
 def _plant_rows(result: dict[str, Any]) -> dict[str, str]:
@@ -154,6 +166,8 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
         notes = {f"The optimum is that of {about}": None, **notes}
+    if any((result.get("noise") or {}).get("risk") for result in results):
+        notes["Costs and the optimum are log E exp(θJ)/θ, of which V is the least"] = None
     if any((result.get("held_cost_ratio") or 1) < 1 for result in results):
         notes["A plant in continuous time may pay less than that optimum: the steps overstate the cost"] = None
     notes |= {f"After T follows the law {result['after_T']}": None for result in results if "after_T" in result}

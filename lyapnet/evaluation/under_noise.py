@@ -15,9 +15,12 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.oracles import Report, silent
 from lyapnet.evaluation.references import costs_of_lqr
 from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
+from lyapnet.loop.rollout import NoisyTrajectory
+from lyapnet.value.risk import mean_with_risk
 
 CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
+DEAREST = 0.05  # share of paths whose mean cost measures the risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
 
@@ -25,7 +28,8 @@ class NoiseMeasures(NamedTuple):
     """The measures of many paths of noise.
 
     E J is estimated by the mean of J − M, with M the martingale of V (see lyapnet.loop.rollout.expectations): it has
-    the mean of J for any V, and varies less if V is close to the cost to go.
+    the mean of J for any V, and varies less if V is close to the cost to go. For a risk θ see
+    NoisyTrajectory.expected_cost.
     """
 
     paths: int  # from each initial state
@@ -34,7 +38,11 @@ class NoiseMeasures(NamedTuple):
     plain_mean: float  # mean of J itself
     plain_half_width: float  # of its 95 % interval
     quantiles: dict[str, float]  # of J over all states and paths, by probability
+    dearest_mean: float  # mean of J over the dearest 5 % of all states and paths (conditional value at risk)
     lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
+    risk: float  # θ
+    with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ), from above; None if θ = 0
+    with_risk_half_width: float | None  # of its 95 % interval
 
 
 @torch.no_grad()
@@ -43,7 +51,8 @@ def measure_under_noise(
 ) -> tuple[StateTable, NoiseMeasures, PerState | None]:
     """(table with one row for each state, measures of the noise, E J under LQR or None if there is no such law).
 
-    LQR is rolled out on the same paths; its E J is that of the controller plus the mean difference of both costs.
+    LQR is rolled out on the same paths; its E J is that of the controller plus the mean difference of both costs. With
+    a risk, the costs of the table and of LQR are certainty equivalents.
 
     Args:
         counted: number of first states that the measures are about.
@@ -51,7 +60,7 @@ def measure_under_noise(
     problem, horizon = controller.problem, controller.horizon
     assert problem.noise is not None
     controller.compile_for(x0)
-    tables, plain, lqr = list[StateTable](), list[Tensor](), list[Tensor]()
+    tables, plain, lqr, means = list[StateTable](), list[Tensor](), list[Tensor](), list[Tensor]()
     for path in range(paths):
         progress(path, paths)
         noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
@@ -59,26 +68,35 @@ def measure_under_noise(
         expected, left = cost_within_domain(problem, trajectory)
         tables.append(replace(measure(problem, controller.program, trajectory), cost=expected, left=left))
         plain.append(trajectory.cost.where(expected.isfinite(), torch.inf))
+        assert isinstance(trajectory, NoisyTrajectory)
+        means.append(trajectory.mean_cost.where(expected.isfinite(), torch.inf))
         other = costs_of_lqr(problem, x0, noise)
         lqr += [] if other is None else [other]
     table = average(tables)
-    cost, J = torch.stack([each.cost for each in tables])[:, :counted], torch.stack(plain)[:, :counted]
-    value = table.value[:counted]
+    cost, J = (torch.stack(each)[:, :counted] for each in (means, plain))
+    value, with_risk = table.value[:counted], torch.stack([each.cost for each in tables])[:, :counted]
     levels = np.quantile(
         J.double().numpy(force=True), QUANTILES, method="inverted_cdf"
     ).tolist()  # of finite costs or not
     measures = NoiseMeasures(
         paths, float(cost.mean()), _half_width(cost), float(J.mean()), _half_width(J),
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
+        float(J.flatten().double().topk(math.ceil(DEAREST * J.numel())).values.mean()),
         float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
+        problem.risk, float(with_risk.mean()) if problem.risk else None,
+        _half_width(with_risk) if problem.risk else None,
     )  # fmt: skip
-    return table, measures, _cost_on_same_paths(table.cost, plain, lqr) if lqr else None
+    return table, measures, _cost_on_same_paths(table.cost, plain, lqr, problem.risk) if lqr else None
 
 
-def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor]) -> PerState:
-    """E J of another law, from an estimate of E J of this one and the costs of both on the same paths."""
-    difference = (torch.stack(others) - torch.stack(J)).mean(0)
-    return torch.where(difference.isfinite(), cost + difference, torch.stack(others).mean(0))
+def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor], risk: float) -> PerState:
+    """E J of another law, from an estimate of E J of this one and the costs of both on the same paths.
+
+    With a risk both are certainty equivalents.
+    """
+    own, other = (mean_with_risk(torch.stack(each), risk) for each in (J, others))
+    difference = other - own
+    return torch.where(difference.isfinite(), cost + difference, other)
 
 
 def _half_width(samples: Tensor) -> float:

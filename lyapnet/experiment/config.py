@@ -290,6 +290,10 @@ class Config:
     noise: dict[str, float] = setting(
         {}, "σ of states that noise drives, each as STATE: σ in its unit per √s; see the page on noise.", at_least=0
     )
+    risk: float = setting(
+        0.0, "θ in 1/(unit of the cost): what is minimised is log E exp(θJ)/θ over noise or random plants; 0: E J.",
+        at_least=0,
+    )  # fmt: skip
     randomise: dict[str, list[float]] = setting(
         {}, "Ranges [least, greatest] of parameters of the plant that V and the law are not told; see the page on "
         "plants that differ.",

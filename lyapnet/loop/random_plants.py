@@ -13,7 +13,8 @@ from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import PolicyOutput, ValuePolicy
 
-ON_MODEL = slice(0, None, 2)  # the closed loops of a training batch that run on the model; the others on random plants
+ON_MODEL = slice(0, None, 2)  # the closed loops of a training batch that run on the model
+ON_PLANTS = slice(1, None, 2)  # the others, on random plants
 
 StateOfPlant = Float[Tensor, "*batch states_and_parameters"]  # (x, p)
 

@@ -46,8 +46,9 @@ class Response(NamedTuple):
 class Problem(nn.Module):
     """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U subject to ẋ = f(x) + g(x)u, h(x) ≤ 0, for all x₀ ∈ X₀.
 
-    With noise σ, dx = (f + gu) dt + σ(x) dW, and the expectation E J(x₀) is minimised. Methods about a step, such as
-    `step` and `response`, are about the step without noise.
+    With noise σ, dx = (f + gu) dt + σ(x) dW, and the expectation E J(x₀) is minimised; with a risk θ > 0 it is
+    (1/θ) log E exp(θ J(x₀)), for which dear paths count more. Methods about a step, such as `step` and `response`, are
+    about the step without noise.
 
     Args:
         system: f and g.
@@ -57,9 +58,11 @@ class Problem(nn.Module):
         horizon: T, its steps, and their integrator with u held.
         constraints: h; None: there are none.
         noise: σ; None: that of the system, if it has a method `noise(x)`.
+        risk: θ in 1/(unit of the cost); 0: the mean cost counts.
 
     Raises:
-        ValueError: the dimension of X₀, or of the cost's goal or rest, differs from that of the system.
+        ValueError: the dimension of X₀, or of the cost's goal or rest, differs from that of the system; or the risk is
+            negative or not finite.
     """
 
     system: ControlAffineSystem
@@ -69,6 +72,7 @@ class Problem(nn.Module):
     horizon: Horizon
     constraints: Constraints | None
     noise: Noise | None
+    risk: float
     findings: Findings
 
     def __init__(
@@ -80,6 +84,7 @@ class Problem(nn.Module):
         horizon: Horizon,
         constraints: Constraints | None = None,
         noise: Noise | None = None,
+        risk: float = 0.0,
     ):
         super().__init__()
         if initial_states.dimension != system.n:
@@ -97,6 +102,9 @@ class Problem(nn.Module):
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
         self.noise = SystemNoise(system, initial_states.center) if noise is None and system.noisy else noise
+        if not 0 <= risk < math.inf:
+            raise ValueError(f"Expected a finite risk ≥ 0, got {risk}; 0 is the mean cost.")
+        self.risk = float(risk)
         self.findings = Findings()
 
     @property
@@ -216,6 +224,8 @@ class Problem(nn.Module):
         other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
         if "noise" not in parts and not ("system" in parts and isinstance(self.noise, SystemNoise)):
             other.noise = self.noise
+        if "risk" not in parts:
+            other.risk = self.risk
         if parts.keys().isdisjoint(("cost", "system")):
             other.findings = self.findings
         if "initial_states" in parts:

@@ -13,8 +13,8 @@ from lyapnet.base.random_streams import NOISE, PLANTS, POINTS, VALIDATION, strea
 from lyapnet.base.types import PerState, State
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
-from lyapnet.loop.random_plants import ON_MODEL, RandomPlants, StateOfPlant
-from lyapnet.loop.rollout import Rollout, Trajectory
+from lyapnet.loop.random_plants import ON_MODEL, ON_PLANTS, RandomPlants, StateOfPlant
+from lyapnet.loop.rollout import NoisyTrajectory, Rollout, Trajectory
 from lyapnet.task.cost import PenaltyCost, spread
 from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
@@ -161,6 +161,21 @@ class Learner(nn.Module):
         self.validation_loss = float(loss)
         return loss
 
+    @torch.no_grad()
+    def _weights(self, trajectory: Trajectory) -> PerState:
+        """The weights of closed loops in the mean cost with a risk θ: exp(θJ) over its mean for the same x₀.
+
+        The derivative of (1/θ) log E exp(θJ) is the mean of that of J with these weights. Under noise they are
+        exp(θ Σ D_n), see Trajectory.compensated, on random plants exp(θ (J − V(0, x₀))); both with a mean of one.
+        """
+        if isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None:
+            excess, others = trajectory.surprise.sum(0), slice(None)
+        else:
+            excess, others = trajectory.cost - trajectory.require_value()[0], ON_PLANTS
+        weights = torch.ones_like(excess)
+        weights[others] = len(excess[others]) * torch.softmax(self.problem.risk * excess[others], 0)
+        return weights
+
     def _spread_of_optima(self, cost: PerState) -> Tensor | None:
         """The spread of the optima, which makes losses of different steps comparable; None for a task with a goal.
 
@@ -180,9 +195,10 @@ class Learner(nn.Module):
         over_processes: Callable[[Tensor], Tensor] = lambda value: value,
     ) -> ProgramOutput:
         """Evaluate the program, with its pointwise condition if there is one."""
+        weights = self._weights(trajectory) if self.problem.risk else None
         trajectory = trajectory.compensated()
         on_model = ... if self.plants is None else ON_MODEL
-        output = self.program(trajectory, over_processes, spread_of_costs, on_model)
+        output = self.program(trajectory, over_processes, spread_of_costs, on_model, weights)
         if self.pointwise is None:
             return output
         values, size = trajectory.require_value(), spread_of_costs

@@ -9,6 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lyapnet.base.errors import UsageError
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.types import State
 from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
@@ -33,6 +34,7 @@ from lyapnet.value.expansions import (
 )
 from lyapnet.value.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_reason, singular
 from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
+from lyapnet.value.risk import mean_with_risk
 
 TRIAL_STATES = 64  # states of X₀ on which candidates are compared
 RANDOM_GUESSES = 6  # random controls as initial guesses for the optimum from the centre of X₀
@@ -62,6 +64,9 @@ def choose_start(
         report: called with each stage of the work.
         known: called with each candidate as soon as its cost is known.
         may_look_ahead: whether training may replace the sampled law by the lookahead law.
+
+    Raises:
+        UsageError: in a task with risk no expansion exists, as with too large a risk.
     """
     if not has_place_for_start(learners):
         return None
@@ -87,6 +92,11 @@ def choose_start(
         progress = partial(report, LOOPS_UNDER_NOISE)
         if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
             attempt(LOOPS_UNDER_NOISE, expansion)
+    if problem.risk and problem.noise is not None and not expansions:
+        raise UsageError(
+            f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
+            "no expansion; choose a smaller risk."
+        )
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])
@@ -107,6 +117,7 @@ def choose_start(
     if seeks_optima and type(policy) is SampledPolicy:
         report("closed loops of the law that looks ahead")
         gain_ahead = _gain_by_looking_ahead(policy, x0[:TEST_STATES])
+        may_look_ahead = may_look_ahead and not problem.risk  # which that law does not know
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
             policy = LookaheadPolicy(problem, policy.V)
             chosen = _fit_for_looking_ahead(learners, list(expansions.values()), drawn, optimum, trials)
@@ -294,7 +305,8 @@ class _Trials:
         cost = (learner or self.learner).path_from(self.x0, self.increments).cost
         share = float(cost.isfinite().double().mean())
         seconds = time.perf_counter() - self.began
-        candidate = Candidate(name, float(cost.mean()), share, seconds, note=self.notes.get(name, ""))
+        mean = mean_with_risk(cost.unflatten(0, (-1, TRIAL_STATES)), self.learner.problem.risk).mean()
+        candidate = Candidate(name, float(mean), share, seconds, note=self.notes.get(name, ""))
         self.tried.insert(0 if name == ZERO_VALUE else len(self.tried), candidate)
         self.known(candidate)
         return candidate

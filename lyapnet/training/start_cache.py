@@ -94,7 +94,7 @@ def _cache_file(learners: Sequence[Learner], may_look_ahead: bool) -> Path | Non
         VERSION, torch.__version__, [(graph.code, constants_of(graph)) for graph in graphs], problem.goal.tolist(),
         box.lower.tolist(), box.upper.tolist(), type(controls).__qualname__,
         [(name, buffer.tolist()) for name, buffer in controls.named_buffers()], vars(problem.horizon),
-        type(policy).__qualname__, may_look_ahead, states_of_value(learners[0]), search.MAX_OPTIMA,
+        type(policy).__qualname__, may_look_ahead, problem.risk, states_of_value(learners[0]), search.MAX_OPTIMA,
         optima.MAX_OPTIMA_OF_DIMENSION, pretraining.method_for(problem).steps,
         [(learner.seed, type(learner.V).__qualname__, str(learner.V), _digest(learner)) for learner in learners],
     ]  # fmt: skip

@@ -32,6 +32,9 @@ class Missing(NamedTuple):
     remedy: str
 
 
+TOO_MUCH_RISK = Missing("under any law E exp(risk · J) is infinite there", "choose a smaller risk")
+
+
 class Linearisation(NamedTuple):
     """ẋ ≈ f + gu* + A(x − x*) + g(u − u*) around the goal x* and the control at rest u*; may be non-finite."""
 
@@ -66,6 +69,8 @@ def riccati_or_reason(problem: Problem) -> Expansion | Missing:
     except LinAlgError as error:
         return singular(error)
     if not all(part.isfinite().all() for part in expansion):
+        if problem.risk and all(part.isfinite().all() for part in riccati(problem.replaced(risk=0.0))):
+            return TOO_MUCH_RISK
         return Missing(
             "the Riccati recursion leaves the finite numbers", "choose a shorter horizon, or a smaller horizon.dt"
         )

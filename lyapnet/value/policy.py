@@ -16,6 +16,7 @@ from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.value.derivatives import jacobian
 from lyapnet.value.expansions import held_control, riccati
+from lyapnet.value.risk import risk_gain
 
 DESCENTS = 3  # Newton steps of the lookahead law
 STEEP = 5  # the same with constraints, near which V is steep
@@ -127,7 +128,8 @@ class SampledPolicy(ValuePolicy):
     F = x + Δt(f + gu), B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x
     it is the optimal law of a linear problem, and finite at any Δt, whereas −½R⁻¹gᵀV_x is unstable under Euler steps if
     Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. Both agree as Δt → 0. H is V's own model of its curvature, or the Riccati
-    solution at the goal, or zero without a goal. With a target, u − u* replaces u, and f + gu* replaces f.
+    solution at the goal, or zero without a goal. With a target, u − u* replaces u, and f + gu* replaces f. In a task
+    with risk V is replaced by its certainty equivalent over the step, with curvature H (see lyapnet.value.risk).
     """
 
     held: bool = True
@@ -143,8 +145,11 @@ class SampledPolicy(ValuePolicy):
 
     def forward(self, t: Time, x: State) -> Control:
         after, free = self._after(t), self.problem.response(x)
-        V_x = self.V.value_and_state_gradient(after, free.x)[1]
-        return held_control(self.problem, free, V_x, self._curvature(after))
+        V_x, H = self.V.value_and_state_gradient(after, free.x)[1], self._curvature(after)
+        if self.problem.risk and self.problem.noise is not None:
+            G = risk_gain(H, self.problem.noise(x), self.problem.horizon.dt, self.problem.risk)
+            V_x, H = V_x + apply(H, apply(G, V_x)), H + multiply(H, multiply(G, H))
+        return held_control(self.problem, free, V_x, H)
 
     def _after(self, t: Time) -> Time:
         """t + Δt, at most T."""

@@ -21,6 +21,7 @@ from lyapnet.evaluation.tables import evaluation_table
 from lyapnet.evaluation.under_noise import _half_width, measure_under_noise
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
+from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.noise import StateNoise
@@ -128,6 +129,49 @@ def test_a_worse_law_costs_more_and_a_wrong_V_keeps_the_mean():
     optimum = oracle_of(problem)(x0)
     assert float((table.cost - optimum).mean()) > 3 * noise.half_width
     assert abs(float(table.cost.mean()) - noise.plain_mean) < 2 * (noise.half_width + noise.plain_half_width)
+
+
+def test_with_risk_costs_are_certainty_equivalents_those_of_the_oracle():
+    problem = task(risk=1.0)
+    x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
+    table, noise, lqr = measure_under_noise(controller_of(problem), x0, 200, 64)
+    optimum, assumed = oracle_of(problem)(x0), noise.with_risk
+    assert assumed is not None
+    assert noise.with_risk_half_width is not None
+    assert abs(float((table.cost - optimum).mean())) < 2 * noise.with_risk_half_width < 0.02 * float(optimum.mean())
+    assert_close(float(table.cost.mean()), assumed)
+    assert assumed > noise.mean + 2 * noise.half_width
+    assert noise.dearest_mean > noise.quantiles["95%"]
+    assert lqr is not None
+    assert_close(lqr, table.cost)
+    # the law without risk costs less on the mean, and more with the risk
+    bold = task()
+    V = OfExpansion(bold, riccati(bold))
+    other = Controller(problem, V, Rollout(problem, lyapnet.SampledPolicy(bold, V), gradient="discrete"))
+    _, worse, _ = measure_under_noise(other, x0, 200, 64)
+    assert worse.with_risk is not None
+    assert worse.with_risk > assumed
+    assert worse.mean < noise.mean
+
+
+def test_the_summary_names_the_risk():
+    result = lyapnet.evaluate(controller_of(task(risk=0.5)), samples=32, paths=8)
+    printed = evaluation_table("title", result)
+    labels = [str(cell) for cell in printed.columns[0]._cells]
+    assert any("θ = 0.5" in label for label in labels)
+    assert any("dearest 5 %" in label for label in labels)
+    assert "log E exp(θJ)/θ" in str(printed.caption)
+    assert result["cost_mean"] == result["noise"]["with_risk"]
+
+
+@pytest.mark.gate
+def test_the_certainty_equivalent_is_that_of_a_grid():
+    problem = task(risk=1.0)
+    found = solve_on_grid(problem, [-4, -5], [4, 5], 61, np.linspace(-12, 12, 49).tolist())
+    x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0)).double()
+    ratio = (found(x0) / oracle_of(problem)(x0)).mean()
+    assert abs(float(ratio) - 1) < 2e-3
+    assert abs(float((found(x0) / oracle_of(problem.replaced(risk=0.0))(x0)).mean()) - 1) > 0.01
 
 
 def test_the_summary_names_what_noise_does():

@@ -2,14 +2,16 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from numpy.polynomial.hermite_e import hermegauss
 from torch import Tensor
 from torch.testing import assert_close
 
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.loop.rollout import Rollout
-from lyapnet.loop.rollout.expectations import MOST_SOURCES, expected_value, sampled_value
+from lyapnet.loop.rollout.expectations import MOST_SOURCES, certainty_equivalent, expected_value, sampled_value
 from lyapnet.loop.rollout.integration import NoisyTrajectory
 from lyapnet.loop.rollout.runge_kutta import Step
 from lyapnet.task.cost import QuadraticCost
@@ -22,6 +24,7 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import riccati
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import HJBPolicy, SampledPolicy
+from lyapnet.value.risk import mean_with_risk
 from tests.problems import OfExpansion
 
 N, DT = 20, 0.1
@@ -302,3 +305,119 @@ def test_a_sampled_expectation_is_unbiased_for_the_fourth_degree_too(modelled):
     assert abs(float(found.mean()) - exact) < error
     points = expected_value(Fourth(modelled), noise, torch.zeros(()), x, x, DT)
     assert abs(float(points) - exact) > error  # 2k points are exact for the third degree alone
+
+
+class Quartic(ValueFunction):
+    """V = ½ xᵀHx + pᵀx + s (x₁ + x₂)⁴, with H as its model of the curvature, or none."""
+
+    def __init__(self, s: float, modelled: bool = True):
+        super().__init__()
+        self.H = torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double()
+        self.p, self.modelled = torch.tensor([0.3, -0.8]).double(), modelled
+        self.s = torch.nn.Parameter(torch.tensor(s).double())
+
+    def forward(self, t, x):
+        return ((x @ self.H) * x).sum(-1) / 2 + x @ self.p + self.s * x.sum(-1) ** 4 + 0 * t
+
+    def curvature(self, t):
+        return self.H if self.modelled else None
+
+
+def integral_with_risk(V: ValueFunction, noise: Noise, mean: Tensor, x: Tensor, risk: float) -> Tensor:
+    """(1/θ) log E exp(θV(mean + σΔW)) by 40² points of Gauss and Hermite."""
+    nodes, weights = hermegauss(40)
+    z = torch.tensor(np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 1, 2))
+    w = torch.tensor(np.outer(weights, weights).reshape(-1, 1) / (2 * math.pi))
+    values = V(torch.zeros(()), mean + math.sqrt(DT) * (noise(x) @ z[..., None])[..., 0])
+    return (w * torch.exp(risk * values)).sum(0).log() / risk
+
+
+@pytest.mark.parametrize("modelled", [True, False])
+@pytest.mark.parametrize("constant", [True, False])
+def test_the_certainty_equivalent_is_its_integral(constant, modelled):
+    task = problem(constant, noise=StateNoise([0.3, 0.4])).double()
+    noise, x = task.noise, initial_states(task).double()
+    assert noise is not None
+    mean, at, risk = 0.9 * x + 0.1, torch.zeros(()).double(), 0.5
+    with torch.no_grad():
+        errors = list[float]()
+        for s in (0.0, 0.02):
+            V = Quartic(s, modelled)
+            found = certainty_equivalent(V, noise, at, mean, x, DT, risk)
+            errors.append(float((found - integral_with_risk(V, noise, mean, x, risk)).abs().max()))
+        assert errors[0] < (1e-12 if modelled else 2e-3)
+        assert errors[1] < 2e-3
+        plain = expected_value(Quartic(0.02), noise, at, mean, x, DT)
+        assert float((plain - found).abs().max()) > 0.01  # the mean is another number
+
+
+def test_the_certainty_equivalent_has_the_derivatives_of_its_integral():
+    task = problem(False).double()
+    noise, V, at = task.noise, Quartic(0.02), torch.zeros(()).double()
+    assert noise is not None
+    x = initial_states(task).double().requires_grad_()
+    found, exact = (
+        torch.autograd.grad(value.sum(), [x, V.s])
+        for value in (
+            certainty_equivalent(V, noise, at, 0.9 * x + 0.1, x, DT, 0.5),
+            integral_with_risk(V, noise, 0.9 * x + 0.1, x, 0.5),
+        )
+    )
+    for one, other in zip(found, exact, strict=True):
+        assert_close(one, other, rtol=0.02, atol=0.02)
+
+
+def test_exponentials_of_surprises_have_mean_one_with_risk_and_not_without():
+    task = problem().replaced(risk=0.8)
+    V = value_of(task)
+    rollout = Rollout(task, SampledPolicy(task, V), gradient="discrete")
+    x0 = task.initial_states.center.expand(20_000, -1)
+    with torch.no_grad():
+        trajectory = rollout(x0, drawn(task, x0))
+    assert isinstance(trajectory, NoisyTrajectory)
+    assert trajectory.surprise is not None
+    each = torch.exp(0.8 * trajectory.surprise.sum(0))
+    assert abs(float(each.mean()) - 1) < 4 * float(each.std()) / math.sqrt(len(each)) < 0.02
+    other = torch.exp(0.8 * (trajectory.surprise.sum(0) + 0.05))
+    assert abs(float(other.mean()) - 1) > 4 * float(each.std()) / math.sqrt(len(each))
+    # V is right, so that each path has the certainty equivalent as its sample, up to the errors of a step
+    found = trajectory.expected_cost
+    assert_close(float(found.mean()), float(trajectory.require_value()[0, 0]), rtol=0.01, atol=0)
+    assert float(found.std()) < 0.7 * float(trajectory.cost.std())
+    assert float(trajectory.mean_cost.mean()) < float(found.mean()) - 0.01
+
+
+def test_with_the_right_value_function_compensated_residuals_vanish_with_risk():
+    task = problem().replaced(risk=0.8).double()
+    x0 = initial_states(task)
+    for V, right in ((value_of(task), True), (value_of(task.replaced(risk=0.0)), False)):
+        with torch.no_grad():
+            trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)).compensated()
+        error = float(ValueProgram().constraint_loss(trajectory.require_value(), trajectory).max())
+        assert (error < 1e-20) == right
+
+
+def test_weights_give_the_derivative_of_the_cost_with_risk():
+    """d/da of (1/θ) log E exp(θ J_a), by differences on common paths, for the shares a of the feedback."""
+    risk, task = 0.8, problem().replaced(risk=0.8).double()
+    x0 = task.initial_states.upper.expand(4000, -1)
+    increments = drawn(task, x0)
+
+    def cost(share: Tensor) -> Tensor:
+        x, J = x0, torch.zeros(len(x0)).double()
+        for increment in increments:
+            u = -share * (x @ torch.tensor([[1.0], [1.2]]).double())
+            x, paid = task.step(x, u)[0], task.step(x, u)[1]
+            x = x + task.noise.displacement(x, increment)  # pyright: ignore[reportOptionalMemberAccess]
+            J = J + paid
+        return J + task.cost.terminal(x)
+
+    share = torch.tensor(0.9).double().requires_grad_()
+    J = cost(share)
+    weights = len(J) * torch.softmax(risk * J.detach(), 0)
+    (found,) = torch.autograd.grad((weights * J).mean(), share)
+    (plain,) = torch.autograd.grad(cost(share).mean(), share)
+    with torch.no_grad():
+        after, before = (mean_with_risk(cost(share + h), risk) for h in (1e-5, -1e-5))
+    assert_close(found, (after - before) / 2e-5, rtol=1e-6, atol=0)
+    assert abs(float(plain - found)) > 0.02 * abs(float(found))

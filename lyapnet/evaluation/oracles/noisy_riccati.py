@@ -36,7 +36,7 @@ def noisy_riccati(problem: Problem, free: bool) -> NoisyRiccatiOracle:
         free: whether the task has neither control limits nor constraints.
 
     Raises:
-        OracleError: the task is not linear-quadratic, or σ is not affine in x.
+        OracleError: the task is not linear-quadratic, σ is not affine in x, or not constant in a task with risk.
     """
     system, cost, noise = problem.system, problem.cost, problem.noise
     assert noise is not None
@@ -46,7 +46,19 @@ def noisy_riccati(problem: Problem, free: bool) -> NoisyRiccatiOracle:
             "Expected a linear system without limits, a quadratic cost, and σ affine in x, for an optimum under noise, "
             "got others; costs stand alone."
         )
-    return NoisyRiccatiOracle(riccati(problem))
+    if problem.risk and not _is_constant(problem, noise):
+        raise OracleError("Expected a constant σ for an optimum with risk, got another; costs stand alone.")
+    solution = riccati(problem)
+    if not all(part.isfinite().all() for part in solution):
+        raise OracleError("Expected a smaller risk, got one with which no law keeps E exp(risk J) finite.")
+    return NoisyRiccatiOracle(solution)
+
+
+def _is_constant(problem: Problem, noise: Noise) -> bool:
+    """Whether σ, which is affine, is the same at the goal and at states of X₀."""
+    x = problem.initial_states.sample(128, torch.Generator().manual_seed(0)).to(problem.goal)
+    at_goal = noise(problem.goal[None])
+    return bool((noise(x) - at_goal).abs().max() <= AFFINE_TOLERANCE * at_goal.abs().max())
 
 
 def _is_affine(problem: Problem, noise: Noise) -> bool:

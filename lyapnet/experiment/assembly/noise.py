@@ -4,7 +4,9 @@ from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import index_of
 from lyapnet.experiment.config import Config
+from lyapnet.loop.rollout.expectations import MOST_SOURCES
 from lyapnet.task.noise import Noise, StateNoise
+from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 
 
@@ -33,6 +35,25 @@ def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
         strengths[i] = strength
     with section("noise"):
         return StateNoise(strengths)
+
+
+def check_risk(config: Config, problem: Problem) -> None:
+    """Check that a task with risk has something random, and what can be done with it.
+
+    Raises:
+        UsageError: there is neither noise nor random plants, too many sources of noise, or the lookahead law.
+    """
+    if not config.risk:
+        return
+    if problem.noise is None and not config.randomise:
+        raise UsageError(f"Expected noise or randomise with risk, got neither and risk={config.risk:g}; give one.")
+    if problem.noise is not None and problem.noise.sources > MOST_SOURCES:
+        raise UsageError(
+            f"Expected at most {MOST_SOURCES} sources of noise with risk, got {problem.noise.sources}; the mean of an "
+            "exponential over more of them is not computed: leave risk out."
+        )
+    if config.rollout.policy == "lookahead":
+        raise UsageError("Expected rollout.policy=sampled or hjb with risk, got lookahead; it knows no risk.")
 
 
 def _require_support(config: Config) -> None:

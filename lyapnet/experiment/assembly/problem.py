@@ -18,7 +18,7 @@ from lyapnet.experiment.assembly.domain import in_domain
 from lyapnet.experiment.assembly.entries import index_of, repeated, require_length, rows
 from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
-from lyapnet.experiment.assembly.noise import build_noise
+from lyapnet.experiment.assembly.noise import build_noise, check_risk
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
@@ -77,7 +77,16 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = about_target(config, cost, system, controls, initial_states)
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
-        problem = Problem(system, cost, controls, initial_states, horizon, noise=build_noise(config, system))
+        problem = Problem(
+            system,
+            cost,
+            controls,
+            initial_states,
+            horizon,
+            noise=build_noise(config, system),
+            risk=config.risk,
+        )
+        check_risk(config, problem)
         if not config.family and config.cost.name not in COSTS:
             _refuse_free_controls_of_own_cost(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import PerState, State, Time
 from lyapnet.loop.programs.base import Program
 from lyapnet.loop.rollout import ClosedLoop, Rollout
@@ -26,9 +27,10 @@ class PointwiseCondition:
         Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
-    with V̇ = V_t + V_xᵀ(f + g u); under noise V̇ is the mean rate, with ½ tr(σσᵀV_xx) added. ℓ₀ and φ₀ are a share
-    (`floor`) of the batch's mean cost per second and of its mean cost; denominators are detached. Points whose V is too
-    large for a funnel of X₀ do not count. The terms at T are omitted for a stationary V.
+    with V̇ = V_t + V_xᵀ(f + g u); under noise V̇ is the mean rate, with ½ tr(σσᵀV_xx) added, and with risk also
+    (θ/2) |σᵀV_x|². ℓ₀ and φ₀ are a share (`floor`) of the batch's mean cost per second and of its mean cost;
+    denominators are detached. Points whose V is too large for a funnel of X₀ do not count. The terms at T are omitted
+    for a stationary V.
 
     The points of a step depend only on its random stream and the weights, so that a resumed run uses the same ones.
     Half of the points are random, the other half are the worst of four times as many. 30 % lie in the last tenth of the
@@ -120,6 +122,9 @@ class PointwiseCondition:
         rate = time_derivative(self.V, self.closed_loop.system, t, x, u)
         if self.closed_loop.noise is not None:
             rate = rate + noise_derivative(self.V, self.closed_loop.noise(x), t, x)
+            if self.problem.risk:
+                slope = apply(self.closed_loop.noise(x).mT, self.V.value_and_state_gradient(t, x)[1])
+                rate = rate + self.problem.risk / 2 * slope.square().sum(-1)
         excess = self.program.excess(rate, running)
         return self._relative(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
 

@@ -7,6 +7,7 @@ from lyapnet.loop.rollout.integration import (
     FIXED_STEP_METHODS,
     GRADIENTS,
     METHODS,
+    NoisyTrajectory,
     Rollout,
     Trajectory,
 )
@@ -18,6 +19,7 @@ __all__ = [
     "METHODS",
     "ClosedLoop",
     "DiscreteAdjoint",
+    "NoisyTrajectory",
     "Rollout",
     "Trajectory",
 ]

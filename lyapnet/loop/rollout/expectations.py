@@ -11,6 +11,7 @@ from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import PerState, State, StatePath, StepPath, Time, Times, ValuePath
 from lyapnet.task.noise import Increments, Noise
 from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.risk import risk_matrix
 
 MOST_SOURCES = 8  # sources of noise up to which an expectation is one over 2k points
 DIRECTIONS = 4  # pairs of random points with more sources
@@ -24,6 +25,41 @@ def expected_value(V: ValueFunction, noise: Noise, t: Time, mean: State, x: Stat
     """
     columns = math.sqrt(noise.sources * dt) * noise(x).movedim(-1, 0)
     return V(t, torch.cat([mean + columns, mean - columns])).mean(0)
+
+
+def certainty_equivalent(
+    V: ValueFunction, noise: Noise, t: Time, mean: State, x: State, dt: float, risk: float
+) -> PerState:
+    """(1/θ) log E exp(θ V(t, mean + σ(x)ΔW)) over ΔW.
+
+    With m(δ) = c + pᵀδ + ½ δᵀHδ for V(mean + δ), H being V's own model of its curvature or zero, and Q the normal law
+    of ΔW that exp(θm) tilts, with mean w = θΔt S⁻¹σᵀp and covariance Δt S⁻¹,
+
+        (1/θ) log E exp(θV) = m̃ + (1/θ) log E_Q exp(θ (V − m)),
+
+    where m̃ is the certainty equivalent of m (see lyapnet.value.risk). This is so for any c, p and H, which are
+    therefore constants for derivatives. E_Q is the mean over the 2k points w ± √k C_j, with C_j the columns of C and
+    CCᵀ = Δt S⁻¹: exact where V = m, to third order in ΔW elsewhere.
+    """
+    with torch.no_grad():
+        c, p = V.value_and_state_gradient(t, mean)
+        H = V.curvature(t)
+        H = p.new_zeros(p.shape[-1], p.shape[-1]) if H is None else H
+    sigma = once_if_constant(noise(x))
+    root = torch.linalg.cholesky(risk_matrix(H, sigma, dt, risk))
+    slope = apply(sigma.mT, p)
+    w = risk * dt * torch.cholesky_solve(slope[..., None], root)[..., 0]
+    offsets = math.sqrt(noise.sources * dt) * torch.linalg.inv(root).movedim(-2, 0)  # S⁻¹ = root⁻ᵀ root⁻¹
+    steps = torch.stack([apply(sigma, w + offset) for each in offsets for offset in (each, -each)])
+    model = c + (steps * (p + apply(H, steps) / 2)).sum(-1)
+    excess = risk * (V(t, mean + steps) - model)
+    tilted = c + (w * slope).sum(-1) / 2 - root.diagonal(0, -2, -1).log().sum(-1) / risk
+    return tilted + (torch.logsumexp(excess, 0) - math.log(len(steps))) / risk
+
+
+def once_if_constant(sigma: NoiseMatrix) -> Tensor:
+    """σ with axes of length one for those of the batch along which it is expanded, so that it enters products once."""
+    return sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]
 
 
 def sampled_value(
@@ -48,15 +84,16 @@ def _sampling_error(V: ValueFunction, t: Time, sigma: NoiseMatrix, steps: Tensor
     H = V.curvature(t)
     if H is None:
         return torch.zeros_like(steps[0, ..., 0])
-    # a σ that is the same at all states, expanded to them, needs one product
-    one = sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]
+    one = once_if_constant(sigma)
     return ((apply(H, steps) * steps).sum(-1).mean(0) - dt * ((H @ one) * one).sum((-2, -1))) / 2
 
 
 def surprises(
-    V: ValueFunction, noise: Noise, t: Times, x: StatePath, value: ValuePath, increments: Increments
+    V: ValueFunction, noise: Noise, t: Times, x: StatePath, value: ValuePath, increments: Increments, risk: float = 0.0
 ) -> StepPath:
     """D_n = V(t_{n+1}, x_{n+1}) − E[V(t_{n+1}, x_{n+1}) | x_n] of each step, of mean zero, with its gradient.
+
+    With a risk θ > 0 the certainty equivalent replaces the expectation, and exp(θD_n) has mean one.
 
     With more than MOST_SOURCES sources the expectation is a sample of it, from the increments of the same step of
     DIRECTIONS paths of the batch, which are independent of this one's state: its own, and those of the next ones.
@@ -65,6 +102,8 @@ def surprises(
 
     def expected(later: Tensor, x: State, following: State, increments: Tensor, *others: Tensor) -> Tensor:
         mean = following - noise.displacement(x, increments)
+        if risk:
+            return certainty_equivalent(V, noise, later, mean, x, dt, risk)
         if not others:
             return expected_value(V, noise, later, mean, x, dt)
         return sampled_value(V, noise, later, mean, x, others, dt)
@@ -78,16 +117,23 @@ def surprises(
 
 
 @torch.no_grad()
-def martingale(V: ValueFunction, noise: Noise, t: Times, x: StatePath, increments: Increments) -> PerState:
-    """M = Σ_n V_x(t_n, x_n)ᵀσ(x_n)ΔW_n, which has mean zero for any V and makes J − M vary less than J.
+def martingale(
+    V: ValueFunction, noise: Noise, t: Times, x: StatePath, increments: Increments
+) -> tuple[PerState, PerState]:
+    """(M, ⟨M⟩), M = Σ_n V_x(t_n, x_n)ᵀσ(x_n)ΔW_n, which has mean zero for any V, and ⟨M⟩ = Σ_n Δt |σᵀV_x|².
 
-    If V is the cost to go of its law, J − M = V(0, x₀) up to errors of the step: M is a control variate for E J.
+    If V is the cost to go of its law, J − M = V(0, x₀) up to errors of the step: M is a control variate for E J. So is
+    exp(θM − ½θ²⟨M⟩), which has mean one for any V, for E exp(θJ).
     """
+    dt = float(t[1] - t[0])
 
     def terms(t: Tensor, x: State, increments: Tensor) -> Tensor:
-        return (V.value_and_state_gradient(t, x)[1] * noise.displacement(x, increments)).sum(-1)
+        V_x = V.value_and_state_gradient(t, x)[1]
+        moved = (V_x * noise.displacement(x, increments)).sum(-1)
+        return torch.stack([moved, dt * apply(noise(x).mT, V_x).square().sum(-1)], -1)
 
-    return _in_blocks(terms, t[:-1].reshape(-1, *[1] * (x.ndim - 2)), x[:-1], increments).sum(0)
+    both = _in_blocks(terms, t[:-1].reshape(-1, *[1] * (x.ndim - 2)), x[:-1], increments).sum(0)
+    return both[..., 0], both[..., 1]
 
 
 def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:

@@ -43,7 +43,7 @@ class Trajectory(NamedTuple):
 
     @property
     def expected_cost(self) -> PerState:
-        """A sample of E J_N given x₀; without noise J_N itself."""
+        """A sample of E J_N given x₀, or in a task with risk of its certainty equivalent; without noise J_N itself."""
         return self.cost
 
     def compensated(self) -> "Trajectory":
@@ -61,26 +61,46 @@ class NoisyTrajectory(Trajectory):
 
     Attributes:
         martingale: M = Σ_n V_xᵀσΔW, (*batch,), of mean zero.
-        surprise: D_n = V_{n+1} − E[V_{n+1} | x_n], (N, *batch), of mean zero; None if it was not computed.
+        variation: ⟨M⟩ = Σ_n Δt |σᵀV_x|², (*batch,).
+        surprise: D_n = V_{n+1} − E[V_{n+1} | x_n], (N, *batch), of mean zero; None if it was not computed. In a task
+            with a risk θ > 0 the certainty equivalent replaces E, and exp(θD_n) has mean one.
+        risk: θ.
     """
 
     martingale: PerState
+    variation: PerState
     surprise: StepPath | None
+    risk: float
 
     @classmethod
-    def of(cls, trajectory: Trajectory, martingale: PerState, surprise: StepPath | None) -> "NoisyTrajectory":
+    def of(
+        cls, trajectory: Trajectory, martingale: PerState, variation: PerState, surprise: StepPath | None, risk: float
+    ) -> "NoisyTrajectory":
         """A trajectory with the effects of its noise."""
         own = cls(*trajectory)
-        own.martingale, own.surprise = martingale, surprise
+        own.martingale, own.variation, own.surprise, own.risk = martingale, variation, surprise, risk
         return own
 
     def _replace(self, **fields: Any) -> "NoisyTrajectory":
-        return self.of(super()._replace(**fields), self.martingale, self.surprise)
+        return self.of(super()._replace(**fields), self.martingale, self.variation, self.surprise, self.risk)
+
+    @property
+    def mean_cost(self) -> PerState:
+        """J_N − M, which has the mean of J_N and varies less."""
+        return self.cost - self.martingale
 
     @property
     def expected_cost(self) -> PerState:
-        """J_N − M, which has the mean of J_N and varies less."""
-        return self.cost - self.martingale
+        """J_N − M, or in a task with risk V₀ + (exp(θ(J_N − V₀)) − exp(θM − ½θ²⟨M⟩))/θ with V₀ = V(0, x₀).
+
+        The mean of the latter is V₀ + m/θ, where the certainty equivalent (1/θ) log E exp(θJ) is V₀ + log(1 + m)/θ: an
+        upper bound, equal to first order in m, and without variance where V is right.
+        """
+        if not self.risk:
+            return self.mean_cost
+        V0, M, variation = (each.double() for each in (self.require_value()[0], self.martingale, self.variation))
+        growth = torch.exp(self.risk * (self.cost - V0)) - torch.exp(self.risk * M - self.risk**2 / 2 * variation)
+        return (V0 + growth / self.risk).to(self.cost)
 
     def compensated(self) -> Trajectory:
         """The trajectory without the unpredicted part of V, so that programs see expectations over each step.
@@ -213,8 +233,9 @@ class Rollout(nn.Module):
             return trajectory
         surprise, value = None, trajectory.require_value()
         if with_surprises:
-            surprise = surprises(V, noise, t, x, value, increments)
-        return NoisyTrajectory.of(trajectory, martingale(V, noise, t, x.detach(), increments), surprise)
+            surprise = surprises(V, noise, t, x, value, increments, self.problem.risk)
+        moved = martingale(V, noise, t, x.detach(), increments)
+        return NoisyTrajectory.of(trajectory, *moved, surprise, self.problem.risk)
 
     @property
     def takes_steps_of_problem(self) -> bool:

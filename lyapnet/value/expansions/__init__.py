@@ -12,7 +12,7 @@ from lyapnet.value.expansions.dynamic_programming import (
     sizes,
     without_penalty,
 )
-from lyapnet.value.expansions.laws import Expansion, at_rest, greedy_law, held_control
+from lyapnet.value.expansions.laws import Expansion, at_rest, certainty_equivalents, greedy_law, held_control
 from lyapnet.value.expansions.noisy_loops import expansion_under_noise
 from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 
@@ -23,6 +23,7 @@ __all__ = [
     "Optimum",
     "Path",
     "at_rest",
+    "certainty_equivalents",
     "cheapest",
     "exchanged",
     "expansion_under_noise",

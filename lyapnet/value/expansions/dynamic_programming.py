@@ -6,8 +6,9 @@ from V_N = φ is, to second order in (x, u),
 
     k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
 
-With noise V_n also has the mean of V_{n+1} over σ(x)ΔW, ½ Δt tr(σᵀHσ) with σ to first order in x. Trajectories are
-those without noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
+With noise V_n also has the mean of V_{n+1} over σ(x)ΔW, ½ Δt tr(σᵀHσ) with σ to first order in x; with risk Q has the
+certainty equivalent of V_{n+1} (see lyapnet.value.risk), with σ constant over a step. Trajectories are those without
+noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
 
 Along an optimal trajectory k = 0, and V_n is the value function to second order. At a constant state, with F linearised
 and q, φ quadratic, it is the Riccati solution; of an affine system if f does not vanish there.
@@ -31,9 +32,10 @@ from lyapnet.task.noise import Noise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
 from lyapnet.value.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
-from lyapnet.value.expansions.laws import Expansion, greedy_law
+from lyapnet.value.expansions.laws import Expansion, certainty_equivalents, greedy_law
 from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 from lyapnet.value.expansions.step_programs import StepPrograms
+from lyapnet.value.risk import with_risk
 
 STEP_SIZES = tuple(0.5**k for k in range(10))  # α of the line search
 FLOOR = 0.1  # smallest allowed eigenvalue of Q_uu, relative to that of the control cost
@@ -156,7 +158,7 @@ def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path
     if not len(x0):
         return path_under(problem, greedy_law(problem, expansion), x0)
     programs = StepPrograms(problem, STEP_SIZES)
-    path = path_of(problem, *programs.follow(expansion, x0))
+    path = path_of(problem, *programs.follow(certainty_equivalents(problem, expansion), x0))
     if not programs.agrees(path) and programs.forget():  # the problem's constants have changed
         return follow_expansions(problem, expansion, x0)
     return path
@@ -305,9 +307,11 @@ def backward_recursion(
     L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
     W = _quadratic(*steps.end)
     S = None if noise is None else _noise_maps(problem, noise, x[:-1])
+    sigma = None if noise is None or not problem.risk else noise(x[:-1])
     nodes, gains = [W], []
     for k in reversed(range(len(M))):
-        Q = L[k] + M[k].mT @ W @ M[k]
+        later = W if sigma is None else with_risk(W, sigma[k], problem.horizon.dt, problem.risk)
+        Q = L[k] + M[k].mT @ later @ M[k]
         if S is not None:
             Q = Q + (S[k].mT @ W[..., None, 1:, 1:] @ S[k]).sum(-3)
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]

@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, PerState, State, StatePath, ValuePath
 from lyapnet.task.problem import Problem, Response
+from lyapnet.value.risk import risk_gain
 
 
 class Expansion(NamedTuple):
@@ -34,6 +36,20 @@ class Expansion(NamedTuple):
         return self.value[0] + ((self.gradient[0] + apply(self.hessian[0], delta) / 2) * delta).sum(-1)
 
 
+def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
+    """The expansion of what a law minimises: V itself, or in a task with risk its certainty equivalent over a step.
+
+    Args:
+        expansion: of V; the value at its first node and its c are left as they are, as no law needs them.
+    """
+    if problem.noise is None or not problem.risk:
+        return expansion
+    x, value, p, H = expansion
+    G = risk_gain(H[1:], problem.noise(x[:-1]), problem.horizon.dt, problem.risk)
+    p_new, H_new = p[1:] + apply(H[1:], apply(G, p[1:])), H[1:] + H[1:] @ G @ H[1:]
+    return Expansion(x, value, torch.cat([p[:1], p_new]), torch.cat([H[:1], H_new]))
+
+
 def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
     """The control held for Δt that minimises ∫ℓ + V(F(x, u)), for V with gradient V_x at F(x, 0) and curvature H.
 
@@ -55,6 +71,7 @@ def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Con
 
 def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
     """The law (n, x_n) ↦ u_n: the held control for V from an expansion."""
+    expansion = certainty_equivalents(problem, expansion)
 
     def law(n: int, x: State) -> Control:
         H, free = expansion.hessian[n + 1], problem.response(x)

@@ -14,6 +14,7 @@ from lyapnet.base.operators import are_operators, is_transformed, operator
 
 SMALL = 16  # largest number of scalar products for which elementwise operations are faster
 CONVEX = 0.1  # smallest curvature in u relative to that of the control cost
+LARGE = 1024  # entries from which one matrix for many vectors is not copied for each of them
 UNROLLED = 6  # largest number of unknowns of linear systems that are solved by elementwise operations
 
 
@@ -46,6 +47,8 @@ def apply(A: Tensor, v: Tensor) -> Tensor:
     """Av for A of shape (*batch, k, d) or (k, d), and v of shape (*batch, d)."""
     if A.ndim == 2 and A.numel() > SMALL:
         return v @ A.mT
+    if A.ndim > 2 and A.shape[-3] == 1 and v.ndim > 1 and A.shape[-2] * A.shape[-1] >= LARGE:
+        return v @ A[..., 0, :, :].mT
     return multiply(A, v[..., None])[..., 0]
 
 

@@ -26,6 +26,7 @@ PRICE_SOFTNESS = 1e-3  # distance beyond a border at which the price changes fro
 SLACK = 1e-2  # distance by which a step may pass a border at that price; farther away the path counts as invalid
 BORDER_ROUNDING = 1e-6  # distance beyond a border that counts as rounding
 TEST_STATES = 8  # states of X₀ that must all have the same border
+STATES_AT_ONCE = 4096  # states at which functions are evaluated at once, which limits the memory for many states
 SEARCH_REACH, SEARCH_PLACES = 8.0, 64  # distance of the search for borders; number of places on it
 HALVINGS = 60  # bisection steps that then locate a border
 TEST_DISTANCES = (1e-6, 1e-3)  # distances beyond a border at which a function must be undefined: excludes poles
@@ -202,8 +203,11 @@ def find_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, n
         own = x.reshape(1, TEST_STATES, *[1] * (values.ndim - 2), n).expand(*values.shape, n)
         chosen = i.reshape(-1, *[1] * values.ndim).expand(*values.shape, 1)
         states = own.scatter(-1, chosen, values[..., None]).reshape(-1, n)
-        finite = [functions[name](states).reshape(len(states), -1).isfinite().all(-1) for name in names]
-        return torch.stack(finite).all(0).reshape(values.shape)
+        finite = [
+            torch.stack([_is_finite(functions[name](block)) for name in names]).all(0)
+            for block in states.split(STATES_AT_ONCE)
+        ]
+        return torch.cat(finite).reshape(values.shape)
 
     shares = SEARCH_REACH * torch.arange(SEARCH_PLACES + 1).to(x) / SEARCH_PLACES
     first = (~defined(every, start[..., None] + way[..., None] * shares)).int().argmax(-1)
@@ -228,6 +232,12 @@ def find_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, n
         )
         for k in torch.nonzero(taken).flatten().tolist()
     ]
+
+
+def _is_finite(values: Tensor) -> Tensor:
+    """Whether each of a batch of values (k, …) is finite; what is expanded from one of them is looked at once."""
+    different = values[:1] if values.stride(0) == 0 else values
+    return different.isfinite().flatten(1).all(-1).expand(len(values)) if values.ndim > 1 else values.isfinite()
 
 
 def size_of(box: Box) -> Float[Tensor, " n"]:

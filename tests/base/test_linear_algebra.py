@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.base.linear_algebra import SMALL, UNROLLED, apply, is_positive_definite, multiply, solve
+from lyapnet.base.linear_algebra import LARGE, SMALL, UNROLLED, apply, is_positive_definite, multiply, solve
 
 batches = pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
 
@@ -88,3 +88,16 @@ def test_apply(k, d, batch):
         agree(apply, lambda A, v: torch.einsum("...kd,...d->...k", A, v), A, v)
         with pytest.raises(AssertionError):
             agree(apply, lambda A, v: torch.einsum("...kd,...d->...k", 1.001 * A, v), A, v)
+
+
+@pytest.mark.parametrize("leading", [(), (3,)], ids=str)
+def test_apply_of_one_large_matrix_to_many_vectors(leading):
+    """As with a matrix for each vector, but without copies of it."""
+    d = math.isqrt(LARGE) + 1
+    A, v = torch.randn(*leading, 1, d, d), torch.randn(*leading, 7, d)
+    agree(apply, lambda A, v: torch.einsum("...kd,...d->...k", A.expand(*leading, 7, d, d), v), A, v)
+    with pytest.raises(AssertionError):
+        agree(lambda A, v: apply(A.mT, v), lambda A, v: torch.einsum("...kd,...d->...k", A, v), A, v)
+    with torch.profiler.profile(profile_memory=True) as profile:
+        apply(A.expand(*leading, 1, d, d), torch.randn(*leading, 1000, d))
+    assert max(event.self_cpu_memory_usage for event in profile.key_averages()) < 100 * A.nbytes

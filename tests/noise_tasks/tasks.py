@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class Task(NamedTuple):
-    """A task.yaml, and what is known of it.
+    """A config, and what is known of it.
 
     Attributes:
         file: its config; a system.py may lie beside it.
@@ -113,20 +113,21 @@ def unknown(n: int, x: Tensor) -> Tensor:
     return torch.full((*x.shape[:-1], 1), math.nan, dtype=torch.float64)
 
 
-def folder(name: str) -> Path:
-    """The config of a task of this folder."""
-    return HERE / name / "task.yaml"
+def folder(name: str, file: str = "task.yaml") -> Path:
+    """A config of a task of this folder."""
+    return HERE / name / file
 
 
 TASKS = {
     **{name: Task(folder(name), quadratic) for name in ("lqg_2", "lqg_4", "lqg_12", "lqg_multiplicative")},
-    "ou_easy": Task(folder("ou_easy"), quadratic, 4.055382),
-    "ou_hard": Task(folder("ou_hard"), quadratic, 20.697248),
+    "ou_easy": Task(folder("ornstein_uhlenbeck", "easy.yaml"), quadratic, 4.055382),
+    "ou_hard": Task(folder("ornstein_uhlenbeck", "hard.yaml"), quadratic, 20.697248),
     "ou_linear": Task(folder("ou_linear"), quadratic),
     "double_well": Task(folder("double_well"), wells, 2.087430),
     "hjb_lq": Task(folder("hjb_lq"), logarithm(1, 0, 2**0.5, 30), 4.590162),
     "distant_target": Task(folder("distant_target"), logarithm(1000, 3, 0.4 * 2**0.5, 40), -401.882),
     "quadcopter": Task(folder("quadcopter")),
+    "planar_quadrotor": Task(folder("planar_quadrotor")),
     "van_der_pol": Task(folder("van_der_pol"), on_grid([-4, -5], [4, 5], 101, np.linspace(-10, 10, 41))),
     "pendulum": Task(CONF / "pendulum_noise.yaml", on_grid([-1.5, -8], [4.5, 4], 101, np.linspace(-16, 10, 40))),
     "gap": Task(folder("gap"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),

@@ -15,9 +15,11 @@ from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import Parts, build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.rollout import Rollout
+from lyapnet.task import domain
 from lyapnet.task.domain import SLACK, Border, Domain, DomainCost, as_written, size_of
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
 from lyapnet.value.expansions import optimal_trajectories, path_under
 from tests.fits import shorten_fits
 from tests.tasks_without_goal.consumption import system
@@ -350,3 +352,12 @@ def test_check_says_the_domain_and_who_leaves_it(tmp_path, brief, capsys, monkey
     facts = [fact for fact in json.loads(capsys.readouterr().out)["facts"] if fact["fact"] == "domain"]
     assert facts[1]["found"] == "closed loops of the start leave it from 64 of 64 states of X₀"
     assert facts[1]["advice"].startswith("constraints.lower.capital=0")
+
+
+@pytest.mark.parametrize(("least", "found"), [(1.0, ["x1 upper 1"]), (math.inf, [])], ids=["a root", "none"])
+def test_borders_of_many_states_beside_a_matrix_that_is_the_same_everywhere(least, found):
+    n = 12  # in several blocks of states
+    assert 2 * n * domain.TEST_STATES * domain.SEARCH_PLACES > domain.STATES_AT_ONCE
+    functions = {"f": lambda x: (least - x[..., :1]).sqrt(), "g": lambda x: torch.eye(n).expand(*x.shape, n)}
+    borders = domain.find_borders(functions, Box([-0.5] * n, [0.5] * n), [f"x{i + 1}" for i in range(n)])
+    assert [f"{border.state} {border.side} {border.value:g}" for border in borders] == found

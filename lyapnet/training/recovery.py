@@ -37,7 +37,8 @@ class RisingCost(Callback):
     """Reports a divergence if the cost rises to DIVERGENCE_COST_RATIO times its least value so far.
 
     The cost is the mean over the cheapest COMPARED_SHARE of the validation states. Without a goal the rise is measured
-    relative to the spread of V(0, x₀).
+    relative to the spread of V(0, x₀), under noise to the spread of these costs if that is larger: V(0, x₀) may be
+    nearly the same on all of X₀.
 
     Raises:
         DivergenceError: the cost has risen so far.
@@ -60,9 +61,12 @@ class RisingCost(Callback):
         for member in members_of(pl_module):
             assert member.validation is not None
             costs = member.validation.cost.sort().values
-            cost = float(costs[: math.ceil(COMPARED_SHARE * len(costs))].mean()) if costs.isfinite().all() else math.inf
+            cheapest = costs[: math.ceil(COMPARED_SHARE * len(costs))]
+            cost = float(cheapest.mean()) if costs.isfinite().all() else math.inf
             least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
             size = least if member.problem.has_goal else float(spread(member.validation.value))
+            if member.problem.noise is not None and not member.problem.has_goal and math.isfinite(cost):
+                size = max(size, float(spread(cheapest)))
             if cost - least > (DIVERGENCE_COST_RATIO - 1) * size > 0:
                 module: Any = pl_module
                 raise DivergenceError(

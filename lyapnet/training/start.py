@@ -25,6 +25,7 @@ from lyapnet.value.expansions import (
     Expansion,
     Optimum,
     at_rest,
+    expansion_of_another_way,
     expansion_under_noise,
     greedy_law,
     in_float64,
@@ -43,6 +44,8 @@ TEST_STATES = 16  # states of X₀ on which that is tested
 REGULATOR_LEVELS = tuple(4.0**-k for k in range(9))  # levels tried in `start_from`, relative to the mean V on X₀
 MAX_INITIAL_MISFIT = 0.1  # above this misfit an expansion does not predict the misfit after a fit
 LOOPS_UNDER_NOISE = "loops under noise from states of X₀"  # name of the candidate around them
+ANOTHER_WAY = "loops under noise on another way"  # name of the candidate that begins with random controls
+GUESSES_UNDER_NOISE = 8  # random controls with which it begins
 PATHS_UNDER_NOISE = 4  # paths of the noise from each state on which candidates are compared
 NOT_FINITE_REMEDY = "choose a smaller X₀, or a shorter horizon"
 STEP_ERROR_REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
@@ -97,6 +100,12 @@ def choose_start(
             f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
             "no expansion; choose a smaller risk."
         )
+        if trials.tried:
+            known, progress = _cheapest(trials.tried), partial(report, ANOTHER_WAY)
+            guesses = waves(in_float64(problem), known.cost, GUESSES_UNDER_NOISE)
+            other = expansion_of_another_way(problem, expansions[known.name], guesses, stream(0, START, 10), progress)
+            if other is not None:
+                attempt(ANOTHER_WAY, other)
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])

@@ -1,6 +1,7 @@
 """A training that diverges goes back and on more slowly; it gives up after a while, with the cause."""
 
 import math
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from lyapnet.base.errors import DivergenceError
 from lyapnet.base.files import read_json
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.experiment import train
@@ -135,6 +137,25 @@ def test_a_rising_cost_is_a_divergence(config, tmp_path):
     for each in (watch, resumed):
         with pytest.raises(DivergenceError, match=f"at most {2 * DIVERGENCE_COST_RATIO:g}, as 2 was reached before"):
             validate(each, 1.01 * 2 * DIVERGENCE_COST_RATIO)
+
+
+@pytest.mark.parametrize("noise", [{}, {"velocity": 0.5}], ids=["without noise", "under noise"])
+def test_under_noise_a_rise_within_the_spread_of_costs_is_no_divergence(noise, config, tmp_path, monkeypatch):
+    """In a task without a goal from one initial state, where V(0, x₀) has no spread."""
+    module, watch = build_module(config_from_plain({**config, "noise": noise})), RisingCost()
+    monkeypatch.setattr(Problem, "has_goal", False)
+    trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
+
+    def validate(mean):
+        values = torch.linspace(1.999, 2.001, 64)
+        module.members[0].validation = SimpleNamespace(cost=torch.linspace(mean - 1, mean + 1, 64), value=values)
+        watch.on_validation_end(trainer, module)
+
+    validate(2.0)
+    with nullcontext() if noise else pytest.raises(DivergenceError):
+        validate(2.1)
+    with pytest.raises(DivergenceError):
+        validate(4.0)
 
 
 def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):

@@ -19,7 +19,7 @@ from lyapnet.training import pretraining
 from lyapnet.training.build import build_module
 from lyapnet.training.candidates import ZERO_VALUE
 from lyapnet.training.optimizer import OptimizerOptions
-from lyapnet.training.start import choose_start, expansions_of
+from lyapnet.training.start import ANOTHER_WAY, choose_start, expansions_of
 from lyapnet.value.expansions import optimal_trajectories
 from tests.fits import few_optima
 
@@ -264,3 +264,18 @@ def drag_without_root(problem):
             return torch.stack([x[..., 1], -0.3 * x[..., 1].abs() * x[..., 1]], -1)
 
     return problem.replaced(system=Smooth())
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.1])
+def test_under_strong_noise_training_starts_on_another_way(sigma):
+    """Around the wall with a gap, through which the optimum without noise leads."""
+    _, start = started({
+        "experiment": "gap",
+        "system": {"name": "tests.noise_tasks.gap.system:Walker"},
+        "cost": {"name": "tests.noise_tasks.gap.system:Wall"},
+        "initial_states": {"lower": [0, -0.2], "upper": [0, 0.2]},
+        "horizon": {"steps": 100, "dt": 0.02},
+        "noise": {"aside": sigma},
+    })  # fmt: skip
+    assert (start.chosen.name == ANOTHER_WAY) == (sigma == 0.5)
+    assert (ANOTHER_WAY in [each.name for each in start.candidates]) == (sigma == 0.5)

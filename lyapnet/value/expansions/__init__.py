@@ -13,7 +13,7 @@ from lyapnet.value.expansions.dynamic_programming import (
     without_penalty,
 )
 from lyapnet.value.expansions.laws import Expansion, at_rest, certainty_equivalents, greedy_law, held_control
-from lyapnet.value.expansions.noisy_loops import expansion_under_noise
+from lyapnet.value.expansions.noisy_loops import expansion_of_another_way, expansion_under_noise
 from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "certainty_equivalents",
     "cheapest",
     "exchanged",
+    "expansion_of_another_way",
     "expansion_under_noise",
     "follow_expansions",
     "greedy_law",

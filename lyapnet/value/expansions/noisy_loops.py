@@ -9,11 +9,14 @@ function nearest to l(z) in the mean square, and the affine function nearest to 
 and the recursion of differential dynamic programming takes them in the place of Taylor's. What F̂ leaves of F costs
 ½ E (F − F̂)ᵀH(F − F̂). Loops of the law of V then give new means, and so on. A linear-quadratic task keeps its solution.
 
+Such an expansion knows one way to go. Noise may make another the better one, which without noise costs more:
+`expansion_of_another_way` begins with loops of random controls. Far from an optimum it leaves out the negative part of
+E l_zz, as Gauss and Newton do, and includes it where that leads to.
+
 Source: Gelb (ed.), Applied Optimal Estimation, 1974, ch. 6 (statistical linearisation).
 """
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -30,6 +33,8 @@ SWEEPS = 8  # most expansions, each around loops of the one before
 ENOUGH_GAIN = 1e-3  # relative gain of the mean cost below which they end
 MAX_LOOPS, MIN_LOOPS = 256, 32  # loops under noise in each sweep, in pairs with ΔW and −ΔW
 MAX_ENTRIES = 40_000_000  # numbers in all second derivatives of a sweep, which limits the loops
+LOOPS_OF_A_WAY = 64  # loops of each guess at another way
+MIN_GAIN_OF_A_WAY = 5e-3  # share of the mean cost that another way saves at least
 ENTRIES_AT_ONCE = 4_000_000  # the same for those computed at once
 
 
@@ -45,69 +50,166 @@ def expansion_under_noise(
         law: an expansion whose law gives the first loops, unless the control at rest costs less; None: there is none.
         generator: of the states and of the noise.
     """
-    problem, (N, dt) = in_float64(problem), (problem.horizon.steps, problem.horizon.dt)
-    size = (problem.system.n + problem.system.m) ** 2
-    pairs = max(MIN_LOOPS, min(MAX_LOOPS, MAX_ENTRIES // (N * size))) // 2
-    x0 = problem.initial_states.sample(pairs, generator).double().cpu().repeat(2, 1)
-    assert problem.noise is not None
-    half = problem.noise.draw(N, dt, x0[:pairs], generator)
-    increments = torch.cat([half, -half], 1)
-
-    def loops(law: Callable[[int, State], Control]) -> tuple[Path, float]:
-        path = path_under(problem, law, x0, increments)
-        return path, float(path.cost.mean())
-
-    path, cost = loops(at_rest(problem))
+    loops = _Loops(problem, MAX_LOOPS, generator)
+    first = loops.under([at_rest(loops.problem)])
     if law is not None:
-        other, cost_of_law = loops(greedy_law(problem, law))
-        if not cost < cost_of_law:
-            path, cost = other, cost_of_law
+        other = loops.under([greedy_law(loops.problem, law)])
+        if not loops.costs(first) < loops.costs(other):
+            first = other
         else:
             law = None
-    best, least = None, math.inf
-    for sweep in range(SWEEPS):
-        progress(sweep, SWEEPS)
-        if not math.isfinite(cost):
-            break
-        law = _around(problem, path, law)
-        path, cost = loops(greedy_law(problem, law))
-        if not cost < least:
-            break
-        gain, best, least = least - cost, law, cost
-        if gain <= ENOUGH_GAIN * abs(cost):
-            break
-    return best
+    best, least = loops.descend(first, None if law is None else _batch(law), progress=progress)
+    return best.member(0) if best is not None and least.isfinite() else None
 
 
-def _around(problem: Problem, path: Path, later: Expansion | None) -> Expansion:
-    """The expansion around some loops.
+def expansion_of_another_way(
+    problem: Problem,
+    known: Expansion,
+    guesses: Sequence[Callable[[int, State], Control]],
+    generator: torch.Generator,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Expansion | None:
+    """The cheapest expansion under noise that begins with loops of some laws; None if it saves too little.
+
+    Noise may make a way the best one that without noise costs more. Where derivatives of the loops take more than
+    MAX_ENTRIES numbers none is sought.
 
     Args:
-        later: an expansion whose H weighs what F̂ leaves of F; None: nothing does.
+        known: the expansion whose law has to cost more, by MIN_GAIN_OF_A_WAY, under the same noise.
+        guesses: laws (n, x_n) ↦ u_n, which lead different ways.
+        generator: of the states and of the noise, the same for all.
+    """
+    loops = _Loops(problem, LOOPS_OF_A_WAY, generator)
+    if len(guesses) * loops.entries > MAX_ENTRIES:
+        return None
+    limit = (1 - MIN_GAIN_OF_A_WAY) * float(loops.costs(loops.under([greedy_law(loops.problem, known)])))
+    found, costs = loops.descend(loops.under(guesses), convex=True, progress=progress)
+    if found is None or not float(costs.min()) < limit:
+        return None
+    best = found.member(costs.argmin(0, keepdim=True))
+    exact, cost = loops.descend(loops.under([greedy_law(loops.problem, best.member(0))]), best)
+    return exact.member(0) if exact is not None and float(cost) < limit else best.member(0)
+
+
+class _Loops:
+    """Closed loops under noise from random states of X₀, in pairs with ΔW and −ΔW: a group of loops for each law.
+
+    Args:
+        most: how many in a group, unless their derivatives take too many numbers.
+    """
+
+    def __init__(self, problem: Problem, most: int, generator: torch.Generator):
+        self.problem, (N, dt) = in_float64(problem), (problem.horizon.steps, problem.horizon.dt)
+        assert self.problem.noise is not None
+        size = N * (problem.system.n + problem.system.m) ** 2
+        pairs = max(MIN_LOOPS, min(most, MAX_ENTRIES // size)) // 2
+        self.entries = 2 * pairs * size  # numbers in all second derivatives of a group
+        self.x0 = problem.initial_states.sample(pairs, generator).double().cpu().repeat(2, 1)
+        half = self.problem.noise.draw(N, dt, self.x0[:pairs], generator)
+        self.increments = torch.cat([half, -half], 1)
+
+    def under(self, laws: Sequence[Callable[[int, State], Control]]) -> Path:
+        """The loops of some laws (n, x_n) ↦ u_n, one group after the other."""
+
+        def law(n: int, x: State) -> Control:
+            return torch.cat([law(n, part) for law, part in zip(laws, x.chunk(len(laws)), strict=True)])
+
+        k = len(laws)
+        return path_under(self.problem, law, self.x0.repeat(k, 1), self.increments.repeat(1, k, 1))
+
+    def costs(self, path: Path) -> Tensor:
+        """The mean cost of each group."""
+        return path.cost.unflatten(0, (-1, len(self.x0))).mean(1)
+
+    def descend(
+        self,
+        path: Path,
+        law: Expansion | None = None,
+        convex: bool = False,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> tuple[Expansion | None, Tensor]:
+        """The cheapest expansion of each group, each around loops of the one before; and the mean costs of their laws.
+
+        The cost is infinite where loops are not finite.
+
+        Args:
+            path: the first loops of each group.
+            law: the expansions whose laws gave them, one for each group; None: other laws did.
+            convex: whether E l_zz loses its negative part. A V without it is less exact, but its law leads on from any
+                loops, where the other may be wild.
+        """
+        cost, size = self.costs(path), len(self.x0)
+        going, least = torch.arange(len(cost)), torch.full_like(cost, torch.inf)
+        best = law
+        for sweep in range(SWEEPS):
+            progress(sweep, SWEEPS)
+            finite = cost.isfinite()
+            going, path = going[finite], path.member(finite.repeat_interleave(size))
+            if not len(going):
+                break
+            law = _around(self.problem, path, size, None if law is None else law.member(finite), convex)
+            each = law.member(torch.arange(len(going)).repeat_interleave(size))
+            path = path_under(
+                self.problem, greedy_law(self.problem, each), self.x0.repeat(len(going), 1),
+                self.increments.repeat(1, len(going), 1),
+            )  # fmt: skip
+            cost = self.costs(path)
+            gain = least[going] - cost
+            better = gain > 0
+            rows, least = going[better], least.index_copy(0, going[better], cost[better])
+            best = (
+                law
+                if best is None
+                else Expansion(*(part.index_copy(1, rows, new[:, better]) for part, new in zip(best, law, strict=True)))
+            )
+            further = better & (gain > ENOUGH_GAIN * cost.abs())
+            going, cost, path = going[further], cost[further], path.member(further.repeat_interleave(size))
+            law = law.member(further)
+        return best, least
+
+
+def _batch(expansion: Expansion) -> Expansion:
+    """A batch of one expansion."""
+    return Expansion(*(part[:, None] for part in expansion))
+
+
+def _around(problem: Problem, path: Path, size: int, later: Expansion | None, convex: bool) -> Expansion:
+    """The expansion around each group of loops.
+
+    Args:
+        size: number of loops in a group.
+        later: expansions, one for each group, whose H weighs what F̂ leaves of F; None: nothing does.
+        convex: see `descend`.
     """
     derivatives = StepDerivatives(problem.step, problem.system.n)
-    z = torch.cat([path.x[:-1], path.u], -1)
-    nodes = max(1, ENTRIES_AT_ONCE // (z.shape[1] * z.shape[2] ** 2))
+    z = torch.cat([path.x[:-1], path.u], -1).unflatten(1, (-1, size))
+    nodes = max(1, ENTRIES_AT_ONCE // (z.shape[1] * size * z.shape[-1] ** 2))
     means = list[list[Tensor]]()
     for k in range(0, len(z), nodes):
         block = z[k : k + nodes]
         F, paid, F_z, l_z, l_zz = (
-            part.unflatten(0, block.shape[:2]) for part in derivatives.first(block.flatten(0, 1))
+            part.unflatten(0, block.shape[:3]) for part in derivatives.first(block.flatten(0, 2))
         )
-        middle = block.mean(1, keepdim=True)
-        spread = (block - middle).mT @ (block - middle) / block.shape[1]
-        mean = [part.mean(1) for part in (F, paid, F_z, l_z, l_zz)]
+        middle = block.mean(2, keepdim=True)
+        spread = (block - middle).mT @ (block - middle) / size
+        mean = [part.mean(2) for part in (F, paid, F_z, l_z, l_zz)]
         mean[1] = mean[1] - (mean[4] * spread).sum((-2, -1)) / 2
         if later is not None:
-            left = F - mean[0][:, None] - apply(mean[2][:, None], block - middle)
-            H = later.hessian[k + 1 : k + 1 + len(block), None]
-            mean[1] = mean[1] + (apply(H, left) * left).sum(-1).mean(1) / 2
+            left = F - mean[0][:, :, None] - apply(mean[2][:, :, None], block - middle)
+            H = later.hessian[k + 1 : k + 1 + len(block), :, None]
+            mean[1] = mean[1] + (apply(H, left) * left).sum(-1).mean(2) / 2
         means.append(mean)
-    F, paid, F_z, l_z, l_zz = (torch.cat(parts)[:, None] for parts in zip(*means, strict=True))
-    middle, x = z.mean(1, keepdim=True), path.x.mean(1, keepdim=True)
-    steps = Steps(middle, F, F_z, paid, l_z, l_zz, _end(problem, path.x[-1]), torch.zeros(len(x), 1).bool(), z[0, 0])
-    backward = backward_recursion(problem, x, path.u.mean(1, keepdim=True), steps, None, problem.noise)
-    return backward.expansion.member(0)
+    F, paid, F_z, l_z, l_zz = (torch.cat(parts) for parts in zip(*means, strict=True))
+    if convex:
+        values, vectors = torch.linalg.eigh(l_zz)
+        l_zz = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
+    x = path.x.unflatten(1, (-1, size))
+    ends = [_end(problem, group) for group in x[-1]]
+    end = tuple(torch.cat(parts) for parts in zip(*ends, strict=True))
+    middle, mean_x = z.mean(2), x.mean(2)
+    replaced = torch.zeros(mean_x.shape[:2]).bool()
+    steps = Steps(middle, F, F_z, paid, l_z, l_zz, end, replaced, z[0, 0, 0])
+    return backward_recursion(problem, mean_x, middle[..., problem.system.n :], steps, None, problem.noise).expansion
 
 
 def _end(problem: Problem, x: State) -> tuple[Tensor, Tensor, Tensor]:

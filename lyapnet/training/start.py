@@ -101,9 +101,11 @@ def choose_start(
             "no expansion; choose a smaller risk."
         )
         if trials.tried:
-            known, progress = _cheapest(trials.tried), partial(report, ANOTHER_WAY)
-            guesses = waves(in_float64(problem), known.cost, GUESSES_UNDER_NOISE)
-            other = expansion_of_another_way(problem, expansions[known.name], guesses, stream(0, START, 10), progress)
+            known_best, progress = _cheapest(trials.tried), partial(report, ANOTHER_WAY)
+            guesses = waves(in_float64(problem), known_best.cost, GUESSES_UNDER_NOISE)
+            other = expansion_of_another_way(
+                problem, expansions[known_best.name], guesses, stream(0, START, 10), progress
+            )
             if other is not None:
                 attempt(ANOTHER_WAY, other)
     if not problem.horizon.stationary or not expansions:

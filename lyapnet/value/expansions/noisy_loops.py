@@ -157,11 +157,9 @@ class _Loops:
             gain = least[going] - cost
             better = gain > 0
             rows, least = going[better], least.index_copy(0, going[better], cost[better])
-            best = (
-                law
-                if best is None
-                else Expansion(*(part.index_copy(1, rows, new[:, better]) for part, new in zip(best, law, strict=True)))
-            )
+            if best is None:
+                best = Expansion(*(new.new_zeros(len(new), len(least), *new.shape[2:]) for new in law))
+            best = Expansion(*(part.index_copy(1, rows, new[:, better]) for part, new in zip(best, law, strict=True)))
             further = better & (gain > ENOUGH_GAIN * cost.abs())
             going, cost, path = going[further], cost[further], path.member(further.repeat_interleave(size))
             law = law.member(further)
@@ -204,11 +202,10 @@ def _around(problem: Problem, path: Path, size: int, later: Expansion | None, co
         values, vectors = torch.linalg.eigh(l_zz)
         l_zz = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
     x = path.x.unflatten(1, (-1, size))
-    ends = [_end(problem, group) for group in x[-1]]
-    end = tuple(torch.cat(parts) for parts in zip(*ends, strict=True))
+    phi, slope, bend = (torch.cat(parts) for parts in zip(*(_end(problem, group) for group in x[-1]), strict=True))
     middle, mean_x = z.mean(2), x.mean(2)
     replaced = torch.zeros(mean_x.shape[:2]).bool()
-    steps = Steps(middle, F, F_z, paid, l_z, l_zz, end, replaced, z[0, 0, 0])
+    steps = Steps(middle, F, F_z, paid, l_z, l_zz, (phi, slope, bend), replaced, z[0, 0, 0])
     return backward_recursion(problem, mean_x, middle[..., problem.system.n :], steps, None, problem.noise).expansion
 
 

@@ -63,6 +63,18 @@ def test_a_linear_quadratic_task_has_one_way(known):
         assert_close(found.initially(x0), exact.initially(x0), rtol=1e-9, atol=0)
 
 
+@pytest.mark.parametrize("broken", [0, 2])
+def test_a_guess_whose_loops_are_not_finite_leaves_the_others(broken):
+    problem = problem_in(TASKS["lqg_2"])
+    exact, guesses = riccati(problem), waves(problem, 1.0, 3)
+    half = exact._replace(gradient=exact.gradient / 2, hessian=exact.hessian / 2)
+    guesses[broken] = lambda n, x: x[..., :1] * torch.inf
+    found = expansion_of_another_way(problem, half, guesses, generator())
+    assert found is not None
+    assert_close(found.hessian, exact.hessian, rtol=1e-9, atol=1e-12)
+    assert expansion_of_another_way(problem, half, [guesses[broken]], generator()) is None
+
+
 def test_none_is_sought_where_derivatives_take_too_much_memory(monkeypatch):
     problem = problem_in(TASKS["lqg_2"])
     exact = riccati(problem)

@@ -95,12 +95,7 @@ def choose_start(
         progress = partial(report, LOOPS_UNDER_NOISE)
         if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
             attempt(LOOPS_UNDER_NOISE, expansion)
-    if problem.risk and problem.noise is not None and not expansions:
-        raise UsageError(
-            f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
-            "no expansion; choose a smaller risk."
-        )
-        if trials.tried:
+        if trials.tried and not problem.risk:  # ways are compared by mean costs
             known_best, progress = _cheapest(trials.tried), partial(report, ANOTHER_WAY)
             guesses = waves(in_float64(problem), known_best.cost, GUESSES_UNDER_NOISE)
             other = expansion_of_another_way(
@@ -108,6 +103,11 @@ def choose_start(
             )
             if other is not None:
                 attempt(ANOTHER_WAY, other)
+    if problem.risk and problem.noise is not None and not expansions:
+        raise UsageError(
+            f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
+            "no expansion; choose a smaller risk."
+        )
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])

@@ -74,6 +74,8 @@ from lyapnet.task.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
 from lyapnet.value.networks import FCN, Scaling  # noqa: E402
 from tests.problems import Quadratic  # noqa: E402
 
+pytest_plugins = ("tests.gate",)
+
 torch.set_num_threads(1)
 logging.getLogger("torch.__trace").disabled = True  # no reader of logs in a test wants what torch writes of a trace
 torch.set_warn_always(True)  # else a warning, an error here, would be raised by the first test that earns it only

@@ -12,6 +12,7 @@ from tests.pages import README, ROOT, blocks
 WORKFLOWS = {path.stem: yaml.safe_load(path.read_text("utf-8")) for path in ROOT.glob(".github/workflows/*.yml")}
 TEMPLATES = sorted(ROOT.glob(".github/ISSUE_TEMPLATE/*.yml"))
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+ALL = ".ci/run ${{ matrix.part }}"
 VERSION = "Programming Language :: Python :: 3."
 
 
@@ -26,7 +27,7 @@ def commands(job: dict) -> set[str]:
 def documented() -> set[str]:
     """The commands of the README's blocks, each by itself, and those of .ci."""
     lines = [block.replace("\\\n", " ") for block in blocks("bash", README)]
-    return {part.strip() for line in lines for part in line.replace("\n", "&&").split("&&")} | {".ci/run"}
+    return {part.strip() for line in lines for part in line.replace("\n", "&&").split("&&")} | {ALL}
 
 
 def test_the_matrix_has_the_versions_of_the_project():
@@ -40,6 +41,12 @@ def test_the_commands_are_those_of_the_readme():
     for job in WORKFLOWS["tests"]["jobs"].values():
         assert commands(job) <= documented()
     assert not commands({"steps": [{"run": "pytest -n 3"}]}) <= documented()
+
+
+def test_all_parts_of_the_gate_are_run():
+    job = WORKFLOWS["tests"]["jobs"]["all"]
+    assert ALL in commands(job)
+    assert job["strategy"]["matrix"]["part"] == [f"{k}/4" for k in (1, 2, 3, 4)]
 
 
 def test_the_site_is_built_as_the_pages_say():

@@ -217,6 +217,7 @@ def test_paper_sum_is_the_cost_without_the_step():
         ("nowhere.yaml", [1.0], "config file"),
         (None, None, "task=…"),
     ],
+    ids=lambda value: str(value).removeprefix(f"{CONF}/"),
 )
 def test_impossible_environment_is_refused(task, scale, named):
     with pytest.raises(UsageError, match=named):

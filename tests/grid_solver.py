@@ -1,8 +1,8 @@
 """Dynamic programming on a grid, for two states and one control: an independent optimum under noise.
 
-V_n(x) = min over u of ∫ℓ + E V_{n+1}(F(x, u) + σ(x)ΔW), with a risk θ (1/θ) log E exp(θV) in the place of E V. With cubic splines between the nodes of the grid, the mean over
-ΔW by three points for each source (exact to the fifth degree), and the minimum among given controls, refined by a
-parabola through the best and its neighbours.
+V_n(x) = min over u of ∫ℓ + E V_{n+1}(F(x, u) + σ(x)ΔW), or with a risk θ (1/θ) log E exp(θV) in the place of E V: with
+cubic splines between the nodes of the grid, the mean over ΔW by three points for each source (exact to the fifth
+degree), and the minimum among given controls, refined by a parabola through the best and its neighbours.
 """
 
 import itertools

@@ -25,6 +25,7 @@ from lyapnet.experiment.checkpoint import KEY, read_checkpoint
 from lyapnet.prover.boxes import CutTree
 from lyapnet.prover.kept_proofs import FORMAT, read_proofs, write_proofs
 from tests.exchange.importing.models import linear, onnx
+from tests.marks import sample
 
 SECONDS = 2.0  # of this process, which other work of the machine does not lengthen
 HANGS = 60  # wall seconds after which it is taken to wait for ever
@@ -145,7 +146,7 @@ NO_FILES = {
 }
 
 
-@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("reader", sample(READERS, 3))
 @pytest.mark.parametrize("kind", NO_FILES)
 def test_what_is_no_file_is_refused_at_once(kind, reader, folder, capsys):
     NO_FILES[kind](folder / "thing")

@@ -169,6 +169,7 @@ def test_the_example_of_a_table_keeps_its_contract():
     problem_of(cart).check()
 
 
+@pytest.mark.gate
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning")  # Lightning's own
 def test_the_examples_from_python_train(workplace):
     examples = [block for block in blocks("python") if "lightning.Trainer(" in block]

@@ -149,6 +149,7 @@ def test_the_tail_of_an_obstacle_may_reach_a_goal(center, goal):
     assert problem.has_goal is goal
 
 
+@pytest.mark.gate
 def test_the_exact_v_has_no_regret_and_another_one_has():
     problem = far(level=0.0)
     exact = evaluate(lyapnet.Controller(problem, Exact()), 32, optimum=True)
@@ -239,6 +240,7 @@ def test_nothing_holds_a_goal_that_is_not_there():
     assert (found.beyond, found.loops, found.reason) == ("hold", 0, "the task has no goal")
 
 
+@pytest.mark.gate
 def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
     monkeypatch.setattr("lyapnet.training.penalty_weight.OPTIMA", 4)
     limit = lyapnet.task.constraints.StateLimits([0], [2.2], [1.0], [2.2], ["near"])

@@ -18,6 +18,7 @@ import lyapnet
 from lyapnet.cli import main
 from lyapnet.evaluation import evaluate
 from lyapnet.experiment.checkpoint import read_checkpoint
+from tests.marks import at_the_gate
 
 FIXTURES = Path(__file__).parent / "fixtures" / "version_0.1"
 EVALUATED = sorted(FIXTURES.rglob("evaluate_*.json"))
@@ -104,7 +105,7 @@ def distance(new, old):
     return max(float((new[key] - old[key]).norm() / old[key].norm()) for key in new)
 
 
-@pytest.mark.parametrize(("name", "members"), [("lyapunov", ["."]), ("ensemble", ["seed_0", "seed_1"])])
+@pytest.mark.parametrize(("name", "members"), [("lyapunov", ["."]), at_the_gate(("ensemble", ["seed_0", "seed_1"]))])
 def test_stopped_run_goes_on_to_the_end_that_it_had_under_version_0_1(name, members, tmp_path, monkeypatch):
     run, end = resumed(f"{name}_stopped", tmp_path, monkeypatch), FIXTURES / f"{name}_finished"
     assert distance(weights(run.last), weights(end / "checkpoints/last.ckpt")) < 1e-9
@@ -120,6 +121,7 @@ def test_stopped_run_goes_on_to_the_end_that_it_had_under_version_0_1(name, memb
             assert {step: float(rows[step][tag]) for step in known} == pytest.approx(known, rel=1e-9)
 
 
+@pytest.mark.gate
 def test_another_end_is_found(tmp_path, monkeypatch):
     """The twin: one step less is not the same end."""
     run = resumed("lyapunov_stopped", tmp_path, monkeypatch, "training.iterations=31")

@@ -18,6 +18,7 @@ def test_a_former_name_is_the_same_module(former):
     assert found.__name__ == found.__spec__.name == f"lyapnet.{MOVED[former]}"
 
 
+@pytest.mark.gate
 def test_modules_within_are_the_same_too():
     program = (
         "import sys, lyapnet.certification.funnel, lyapnet.claims.funnel; "

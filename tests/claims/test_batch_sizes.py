@@ -187,6 +187,7 @@ def test_what_comes_with_lyapnet_is_of_each_state_by_itself(system, cost, V):
     assert check_batch_sizes("all of it", everything, [torch.zeros(4), torch.randn(4, system.n)]) is None
 
 
+@pytest.mark.gate
 def test_and_certified():
     V = Bowl(lambda t, x: HONEST["zeros"](x) * x[..., 0])
     found = claim(System(HONEST["reshape"]), V=V, law=lambda problem, V: Law(problem, V, HONEST["einsum"]))

@@ -44,6 +44,7 @@ def test_the_level_of_a_limit_of_the_position():
     assert level(position(b), delta=0.5) == pytest.approx(expected - 0.5 * 2.0, rel=5e-3), "W = V − δt, at T"
 
 
+@pytest.mark.gate
 def test_the_level_of_a_limit_of_the_speed():
     """h = v − b crosses with u = −(p₁₂x + p₂₂v) ≥ 0, so that x ≤ −p₂₂b/p₁₂: xᵀPx is least at its end or minimum."""
     P, b = torch.as_tensor(riccati()), 0.3
@@ -173,6 +174,7 @@ def test_constraints_that_change_with_the_calls_are_refused_or_what_they_were(sa
     assert found.crossing <= safe.crossing * 1.01
 
 
+@pytest.mark.gate
 def test_a_violation_is_one():
     task = task_within(position(1.03))
     found = find_violation(loop(riccati()), task, torch.Generator().manual_seed(0))
@@ -242,6 +244,7 @@ def test_constraints_are_traced_once():
     assert own_constraints(own, domain()) is own
 
 
+@pytest.mark.gate
 def test_states_of_X0_between_the_samples_are_checked():
     """A sliver of X₀ that is 2e-6 wide is excluded."""
 

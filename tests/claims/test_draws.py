@@ -26,6 +26,7 @@ def certified(run, capsys, *options, kind="statistical"):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.gate
 def test_each_further_seed_counts_and_the_same_one_does_not(run, capsys):
     first = certified(run, capsys, "--confidence", "0.99")
     assert (first["draws"], first["confidence_over_draws"]) == (1, pytest.approx(0.99))

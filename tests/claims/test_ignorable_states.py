@@ -136,6 +136,7 @@ def claim():
     )
 
 
+@pytest.mark.gate
 def test_the_funnel_is_that_of_the_other_states(claim):
     """D need not contain X₀ along an ignorable state."""
     plain = plain_claim()

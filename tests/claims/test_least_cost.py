@@ -222,6 +222,7 @@ def of_one_state(cost):
     return claimed(V, about, 0.95, 0.02, Box([-3.0], [3.0]).double())
 
 
+@pytest.mark.gate
 def test_a_running_cost_that_falls_below_zero_beyond_the_level_is_part_of_the_excess():
     """No sample meets the pit, where a control could rest at negative cost; a shallow pit enters e."""
     assert of_one_state(Costly()).verdict == "certified"
@@ -291,6 +292,7 @@ def test_where_nothing_is_proved_nothing_is_said():
     assert (claim.least_cost(torch.tensor([0.0, 1.0])) < 0.02).all()
 
 
+@pytest.mark.gate
 def test_both_sides_of_the_riccati_solution():
     """The ratio of the means follows from α, β and δT; every optimum lies between the bounds."""
     result = certify(Controller(problem(), stationary(riccati())), Funnel(alpha=0.95, delta=0.02), LowerBound()).result

@@ -393,6 +393,7 @@ def parametrized():
     return lambda x: 0.01 * layer(x)[..., 0]
 
 
+@pytest.mark.gate
 def test_constants_that_are_computed_once_are_certified():
     """The counterparts: attributes that the first calls set do not change later."""
     law = lambda problem, V: Law(problem, V, by_lru_cache)  # noqa: E731

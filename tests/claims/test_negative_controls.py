@@ -116,7 +116,7 @@ def test_a_hundred_planted_violations_are_never_certified(first):
     assert "certified" not in controls(range(first, first + 4))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", sample(range(2), 2))
 def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
     """Their states grow, and V grows from the counterexample along a short step, in plain arithmetic."""
     torch.manual_seed(seed)

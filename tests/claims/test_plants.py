@@ -29,6 +29,7 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem, DoubleIntegrator, Pendulum
 from lyapnet.value.policy import HJBPolicy
 from tests.claims.planted import cost, riccati, stationary
+from tests.marks import sample
 from tests.problems import Formula, problem_of
 
 pytestmark = pytest.mark.usefixtures("one_closed_loop")
@@ -164,6 +165,7 @@ def test_where_the_equilibrium_moves_it_says_how_far():
     assert claim.hole > (0.2 / (3 - LAMBDA / 2)) ** 2
 
 
+@pytest.mark.gate
 def test_with_pushes_the_ultimate_bound_is_that_of_the_worst_plant():
     """|x| ≤ W/(decay + 2 − λ/2), decay ≥ 0.5."""
     claim = claimed(leaky(), {"decay": [0.5, 3.0]}, disturbance=torch.tensor([0.3]))
@@ -179,6 +181,7 @@ def words(controller, claim):
     return RegionCertificate(controller, claim, {"seed": 0}).in_words()
 
 
+@pytest.mark.gate
 def test_without_width_the_claim_is_that_of_the_one_plant():
     one, other = claimed(leaky(), {}), claimed(leaky(), {"gain": [1.0, 1.0]})
     assert other.plants.ranges == {"gain": [1.0, 1.0]}
@@ -234,7 +237,7 @@ def test_the_law_and_V_are_told_x_alone():
     assert (about.system.gain, about.system.decay) == (1.0, 1.0), "the comparison does not change the plant"
 
 
-@pytest.mark.parametrize("system", [Bumpy, BumpyFarOut])
+@pytest.mark.parametrize("system", sample([Bumpy, BumpyFarOut], 2))
 def test_what_fails_in_a_thin_slice_of_plants_is_found(system):
     """In the slice nothing contracts at the goal, and V rises far from it. Without the slice there is a region."""
     at = leaky(system(), x0=0.7)

@@ -176,6 +176,7 @@ def test_without_pushes_the_claim_is_what_it_was():
     assert one.proof.fingerprint == other.proof.fingerprint != pushed_claim().proof.fingerprint
 
 
+@pytest.mark.gate
 def test_pushes_end_in_every_well():
     """V = x²(x − 2)² is low around 0 and 2; the claim does not say to which of the two a closed loop goes."""
     about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
@@ -189,6 +190,7 @@ def test_pushes_end_in_every_well():
     assert float(claim.extent.upper) > 2
 
 
+@pytest.mark.gate
 def test_a_constraint_bounds_the_region():
     wall = StateLimits([0], [1.0], [1.0], [1.0], ["position ≤ 1"])
     claim = claimed(about=problem(constraints=wall), disturbance=W)
@@ -398,6 +400,7 @@ def test_another_state_than_those_of_the_system_is_refused():
         certify(controller(), Region(disturbance={"speed": 1}))
 
 
+@pytest.mark.gate
 def test_a_certificate_names_its_disturbance_among_its_options():
     certificate = certify(controller(), Region(states=D, disturbance={"velocity": 0.2}))
     assert "--disturbance=velocity=0.2" in certificate.command("best.ckpt")

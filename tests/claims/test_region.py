@@ -119,6 +119,7 @@ def test_closed_loops_from_its_edge_go_to_the_goal():
     assert after(about, edge).norm(dim=-1).max() < 1e-6
 
 
+@pytest.mark.gate
 def test_a_law_that_leaves_the_goal_has_no_region():
     claim = claimed(stationary(-riccati()), states=Box([-1.0, -1.0], [1.0, 1.0]), seconds=3)
     assert claim.verdict == "unknown"
@@ -127,6 +128,7 @@ def test_a_law_that_leaves_the_goal_has_no_region():
     assert "does not stabilise the goal: its linearisation has an eigenvalue with real part" in claim.reason
 
 
+@pytest.mark.gate
 def test_a_law_that_leaves_further_out_is_falsified():
     """With V = x₁² + x₂² − x₂⁴/2 and u = −x₂ + x₂³, V̇ > 0 beyond |x₂| = 1.2."""
     system = Linear([[-1.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
@@ -221,6 +223,7 @@ def test_where_the_goal_is_no_equilibrium_it_says_how_far_closed_loops_end():
     assert 0.01 <= near.offset <= float(torch.linalg.vector_norm(near.box.widths / 2))
 
 
+@pytest.mark.gate
 def test_a_certificate_does_not_say_the_goal_where_it_is_another_equilibrium():
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     about = problem(Shifted())
@@ -290,6 +293,7 @@ def test_a_constraint_bounds_the_region():
     assert claim.constraints == ("position ≤ 1",)
 
 
+@pytest.mark.gate
 def test_what_is_no_claim_is_refused():
     with pytest.raises(UsageError, match=r"Expected decay > 0, got -1\."):
         prove_region(loop_of(stationary(riccati()), problem()), problem(), -1.0, D)

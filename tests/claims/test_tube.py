@@ -102,6 +102,7 @@ def test_a_linear_flow_and_its_cost_in_closed_form(straight):
     assert claim.bounds_of_cost(torch.tensor([[0.4, 0.0]]))[1].tolist() == [torch.inf], "outside X₀"
 
 
+@pytest.mark.gate
 def test_a_second_integrator_stays_within(swung):
     about = controller(Swinging(), Formula(damped))
     assert swung.verdict == "certified"
@@ -242,6 +243,7 @@ def test_the_certificate_and_its_figure(swung):
     assert len(certificate.figure().axes) == 3
 
 
+@pytest.mark.gate
 def test_two_workers_prove_the_same(swung):
     two = certify(controller(Swinging(), Formula(damped)), Tube(), budget=Budget(60, workers=2)).claim
     assert two.mean_cost == pytest.approx(swung.mean_cost, rel=1e-9)

@@ -65,6 +65,7 @@ def test_modes_and_controllability():
     assert not facts(linear([[-0.5, 0], [0, -1]], [[0], [1]]))["controllable"].advice, "what decays needs no control"
 
 
+@pytest.mark.gate
 def test_limits_and_what_they_do_not_admit():
     task = linear([[0, 1], [0, 0]], [[0], [1]], controls={"lower": -1, "upper": 2})
     assert "1 control between (-1) and (2)" in facts(task)["system"].found
@@ -153,6 +154,7 @@ def test_what_steps_miss_of_continuous_time():
     assert not Start(chosen._replace(cost=float("inf"), finite=0.5), [chosen], 3.0).steps_miss, "nothing to compare"
 
 
+@pytest.mark.gate
 def test_a_start_that_is_not_finite_says_so():
     content = {**TASK, "experiment": "x", "rollout": {"policy": "hjb"}, "cost": {**TASK["cost"], "R": [1e-9]}}
     found = found_of(config_from_plain({**content, "horizon": {"steps": 150, "dt": 0.05}}))

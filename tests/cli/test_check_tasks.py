@@ -200,6 +200,7 @@ def test_an_interrupt_leaves_the_facts(tmp_path):
     assert last.endswith("not reached: the best start.")
 
 
+@pytest.mark.gate
 def test_an_interrupt_leaves_one_json_object(tmp_path, capfd, monkeypatch):
     path = tmp_path / "long.yaml"
     path.write_text(yaml.safe_dump({**LONG, "initial_states": {"lower": 0, "upper": [1, 0]}}))

@@ -166,6 +166,7 @@ def test_the_optimum_is_not_sought_where_it_is_not_wanted(tmp_path, capsys):
     assert not (tmp_path / "cache" / "optima").exists()
 
 
+@pytest.mark.gate
 def test_disturbances_are_reported(tmp_path, capsys):
     arguments = [
         *SMALL,

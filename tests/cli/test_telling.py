@@ -40,6 +40,7 @@ def loading_for(monkeypatch, seconds):
     monkeypatch.setattr("lyapnet.controller.loading.load", slowly)
 
 
+@pytest.mark.gate
 def test_a_command_that_loads_slowly_says_so_and_its_result_stays(checkpoint, monkeypatch, capsys, telling):
     arguments = ["certify", "sampled", checkpoint, "--samples", "10", "--json"]
     loading_for(monkeypatch, 1.0)
@@ -62,6 +63,7 @@ def test_it_is_said_while_an_oracle_hides_what_others_say(capsys, telling):
     assert not hidden.getvalue()
 
 
+@pytest.mark.gate
 def test_training_says_what_it_waits_for(tmp_path, monkeypatch, capsys, telling):
     def slowly(*arguments):
         time.sleep(1.0)

@@ -310,6 +310,7 @@ def test_wrong_value_function_has_a_gap(factor, quadratic):
     assert result["value_error"] == pytest.approx(abs(factor - 1))
 
 
+@pytest.mark.gate
 def test_satisfied_share_follows_the_slack(quadratic):
     """1.1 V* falls by 1.1 ℓ along its own loop but for O(Δt); 0.5 V* by about half of what the condition asks."""
     assert evaluate(riccati(quadratic, 1.1), 8)["satisfied_fraction"] == 1

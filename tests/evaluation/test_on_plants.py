@@ -23,6 +23,7 @@ def measured(states: int = 8, **changes):
     return rollout, x0, measure_on_plants(plants, x0)
 
 
+@pytest.mark.gate
 def test_the_optimum_is_that_of_each_plant():
     """No closed loop is cheaper; and the law of the model costs as much as by its own rollout."""
     rollout, x0, found = measured()
@@ -37,6 +38,7 @@ def test_the_optimum_is_that_of_each_plant():
     assert (alone - of_model).abs() > 1e-3 * of_model
 
 
+@pytest.mark.gate
 def test_plants_that_equal_the_model_cost_as_much_as_the_model():
     rollout, x0, found = measured(randomise={"mass": [1.0, 1.0]})
     assert_close(found.cost, rollout(x0).cost)

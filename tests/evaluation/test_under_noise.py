@@ -106,6 +106,7 @@ def test_an_expansion_along_a_path_has_the_cost_of_the_noise_and_the_path_has_no
     assert_close(optimum.expansion.value[0] - quiet.expansion.value[0], riccati(problem).value[0].expand(3))
 
 
+@pytest.mark.gate
 def test_expected_costs_are_those_of_the_oracle_within_their_interval():
     problem = task()
     x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
@@ -120,6 +121,7 @@ def test_expected_costs_are_those_of_the_oracle_within_their_interval():
     assert [*noise.quantiles.values()] == sorted(noise.quantiles.values())
 
 
+@pytest.mark.gate
 def test_a_worse_law_costs_more_and_a_wrong_V_keeps_the_mean():
     problem = task()
     x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
@@ -174,6 +176,7 @@ def test_the_certainty_equivalent_is_that_of_a_grid():
     assert abs(float((found(x0) / oracle_of(problem.replaced(risk=0.0))(x0)).mean()) - 1) > 0.01
 
 
+@pytest.mark.gate
 def test_the_summary_names_what_noise_does():
     result = lyapnet.evaluate(controller_of(task()), samples=32, paths=8)
     assert result["noise"]["paths"] == 8
@@ -277,6 +280,7 @@ def of_root() -> Problem:
     return build_problem(config_from_plain({"experiment": "root", **content}))
 
 
+@pytest.mark.gate
 def test_paths_that_leave_the_domain_cost_infinitely_and_fail_claims():
     problem = of_root()
     controller = Controller(problem, OfExpansion(problem, riccati(problem.without_noise())))

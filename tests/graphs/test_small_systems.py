@@ -108,6 +108,7 @@ def test_a_matrix_that_is_not_symmetric_is_no_small_system():
     assert operators_of(trace(lambda A, B: (solve(A, B),), [A, B], whole=True)) == ["symmetric_inverse"]
 
 
+@pytest.mark.gate
 def test_under_vmap_functions_are_what_they_are_written_as():
     controls, (R, b) = ControlBox(-1.0, 1.0), convex(5, m=3)
     graph = trace(lambda R, b: (torch.func.vmap(controls.minimise)(R, b),), [R, b], whole=True)

@@ -74,6 +74,7 @@ def test_each_closed_loop_is_that_of_its_plant_under_the_law_of_the_model():
     assert (found.cost - model.cost).abs().max() > 1e-3, "the plants differ from the model"
 
 
+@pytest.mark.gate
 def test_the_gradient_is_that_of_autograd_through_the_steps_by_hand():
     rollout, plants = plants_of()
     theta = [p for p in rollout.closed_loop.V.parameters() if p.requires_grad]
@@ -114,6 +115,7 @@ def test_the_weights_of_a_run_are_kept_once():
     assert with_plants == without
 
 
+@pytest.mark.gate
 def test_single_precision_and_constraints_and_limits_have_plants_too():
     for changes in (
         {"training": {"precision": "float32"}},

@@ -75,6 +75,7 @@ def test_the_distance_after_noise_has_its_mean_square():
     assert not np.allclose(about_a_point(lambda r: r**2, m, 0.7, 99), m**2 + 0.49 * 100)
 
 
+@pytest.mark.gate
 def test_the_law_of_the_wells_is_the_best_of_its_neighbours():
     """V(0, x) is what its law costs on paths of noise, and a law of 0.8 times the control costs more."""
     problem = problem_in(TASKS["double_well"], "horizon.steps=50", "horizon.dt=0.02")
@@ -110,6 +111,7 @@ class Logarithm(lyapnet.Cost):
         return torch.log(1 + 20 * (x**2).sum(-1))
 
 
+@pytest.mark.gate
 def test_around_noisy_loops_the_tip_of_a_logarithm_is_no_guide():
     """The end has curvature 40 at its tip, and far less at states that noise reaches in 20 dimensions."""
     problem = problem_in(TASKS["ou_easy"], "horizon.steps=20", "horizon.dt=0.05").replaced(cost=Logarithm().double())

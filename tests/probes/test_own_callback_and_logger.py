@@ -28,6 +28,7 @@ def costs(run):
     return states["CostOfValidations"]["costs"]
 
 
+@pytest.mark.gate
 def test_callback_runs_and_is_resumed(tmp_path):
     home = f"logs={tmp_path}"
     run = lyapnet.train(CONFIG, [home, "training.iterations=4"])

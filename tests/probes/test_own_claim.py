@@ -39,6 +39,7 @@ def largest_effort(controller):
     return float(controller.policy(0.0, controller.initial_states.corners()).abs().max())
 
 
+@pytest.mark.gate
 def test_a_true_claim_is_certified_and_its_false_twin_is_not(effort, controller):
     largest = largest_effort(controller)
     certificate = lyapnet.certify(controller, effort.Effort(limit=1.01 * largest), budget=30)
@@ -71,6 +72,7 @@ def test_workers_prove_the_same(effort, controller):
     assert certificate.verdict == "certified"
 
 
+@pytest.mark.gate
 def test_it_is_shown_and_reported_like_any_other(effort, controller, tmp_path):
     certificate = lyapnet.certify(controller, effort.Effort(limit=20), budget=30, keep=tmp_path / "kept.proof")
     assert "effort: certified" in str(certificate)

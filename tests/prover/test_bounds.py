@@ -18,6 +18,7 @@ from lyapnet.task.systems import SYSTEMS
 from lyapnet.value.networks import FCN, NETWORKS, Scaling, TerminalAnchor
 from lyapnet.value.policy import POLICIES
 from tests.functions import FUNCTIONS, SMOOTH, box, points_in, without_remainder
+from tests.marks import sample
 from tests.problems import problem_of
 
 
@@ -261,7 +262,7 @@ CONDITIONS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("system", "network", "options"), CONDITIONS)
+@pytest.mark.parametrize(("system", "network", "options"), sample(CONDITIONS, 3))
 def test_whole_conditions_lie_within_bounds(system, network, options):
     c, n = condition(system, network, **options)
 

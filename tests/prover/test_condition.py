@@ -75,6 +75,7 @@ def test_a_gradient_that_is_not_the_derivative_is_refused(name):
         claim(V)
 
 
+@pytest.mark.gate
 def test_the_true_gradient_is_certified():
     """The twin, with kinks and an override that is right."""
     assert claim(Formula(lambda t, x: quadratic(x) + 0.01 * torch.relu(x[..., 0]) + 0 * t)).verdict == "certified"

@@ -26,6 +26,7 @@ from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.prover.counterexamples import violations
 from lyapnet.prover.proof import prove
 from tests.claims.planted import Planted, domain, loop, riccati
+from tests.marks import sample
 from tests.problems import AMPLE
 
 
@@ -64,7 +65,7 @@ def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), (violated, 6.0)])
+@pytest.mark.parametrize(("condition", "wanted"), sample([(dipped, 2.0), (violated, 6.0)], 2))
 def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):
     condition, path = condition(P), tmp_path / "proof.pt"
     whole = go_on(condition, None, wanted=wanted)
@@ -91,6 +92,7 @@ OTHERS = {  # proofs of something else
 }
 
 
+@pytest.mark.gate
 def test_the_proof_of_something_else_is_refused(P, kept):
     before = kept.read_bytes()
     for other in OTHERS.values():
@@ -100,6 +102,7 @@ def test_the_proof_of_something_else_is_refused(P, kept):
     assert go_on(dipped(P), kept).verdict == "certified"
 
 
+@pytest.mark.gate
 def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
     """The twin: a condition that fails on boxes that the other proof had closed."""
     monkeypatch.setattr(kept_proofs.KeptProof, "identity", [])
@@ -271,6 +274,7 @@ def test_resuming_refuses_what_does_not_fit_together(change, P, kept):
         go_on(dipped(P), kept)
 
 
+@pytest.mark.gate
 def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
     path, condition = tmp_path / "proof.pt", violated(P)
     whole = go_on(condition, path, wanted=6.0)
@@ -319,6 +323,7 @@ def test_a_check_refuses_an_unfinished_proof_at_once(P, kept, monkeypatch):
         checked(dipped(P), kept)
 
 
+@pytest.mark.gate
 def test_a_check_refuses_other_cuts_and_another_v(P, finished):
     rewritten(finished, lambda content: content["axis"].zero_())
     assert checked(dipped(P), finished).verdict != "certified"

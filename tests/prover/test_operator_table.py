@@ -209,6 +209,7 @@ WRONG = {
 }
 
 
+@pytest.mark.gate
 @needs_c
 @needs_compiler
 @pytest.mark.parametrize("wrong", [None, *WRONG])

@@ -77,6 +77,7 @@ def test_a_worker_that_is_killed_is_one_line():
     assert threading.active_count() <= before + 2, "the threads of a pool ended with it"
 
 
+@pytest.mark.gate
 def test_another_machine_bounds_the_same_or_nothing():
     """The condition is pickled and traced again: the same boxes to the last bit, or an error."""
     pickle = pytest.importorskip("cloudpickle")

@@ -151,6 +151,7 @@ def test_a_penalty_keeps_the_constraints(name, monkeypatch):
     assert replay(problem, state, free).h > KEPT, "the twin: without constraints they are violated"
 
 
+@pytest.mark.gate
 def test_steps_of_algae_are_too_long():
     """A culture that is fed at a quarter of the rates eats faster than an Euler step of 0.2 days can follow."""
     fine, dt = problem_in(HERE / "algae", "horizon.dt=0.01"), problem_in(HERE / "algae").horizon.dt

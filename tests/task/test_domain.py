@@ -200,6 +200,7 @@ def test_a_state_that_is_zero_in_all_of_x0_has_a_size_of_one():
     assert size_of(lyapnet.Box([0.0, -3.0, 2.0], [0.0, 1.0, 2.0])).tolist() == [1.0, 3.0, 2.0]
 
 
+@pytest.mark.gate
 def test_a_path_that_leaves_has_no_finite_cost_and_an_optimum_stays():
     problem = economy()
     x0 = problem.initial_states.sample(6, torch.Generator().manual_seed(0))
@@ -223,6 +224,7 @@ def test_a_path_that_leaves_has_no_finite_cost_and_an_optimum_stays():
 DECLARED = {**PLAIN, "domain": {"lower": {"capital": 1.0}, "upper": {"capital": 20}}}
 
 
+@pytest.mark.gate
 def test_a_declared_domain_and_the_tighter_border_counts():
     said = str(build_problem(config_from_plain(DECLARED)).domain)
     assert said == "capital > 1, as declared; capital < 20, as declared"
@@ -323,6 +325,7 @@ class WithShare(Village):
         return 0.8 * x ** torch.as_tensor(self.share).to(x)[..., None] - 0.1 * x
 
 
+@pytest.mark.gate
 def test_an_evaluation_counts_what_leaves():
     kept, lost = (evaluate(lyapnet.Controller(economy(), Worth(each)), 16, optimum=False) for each in (0.8, 0.0))
     assert kept["left_domain_fraction"] == 0

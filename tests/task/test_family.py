@@ -114,6 +114,7 @@ def test_v_of_a_linear_family_is_known_before_training():
     assert not torch.allclose(riccati(family).initially(z0 - 0.1), optimum)
 
 
+@pytest.mark.gate
 def test_the_optimum_of_a_family_is_that_of_each_member():
     pytest.importorskip("casadi")
     z0 = torch.tensor([[0.5, 0.0, 0.9, 1.0], [0.5, 0.0, 1.2, 1.5]])

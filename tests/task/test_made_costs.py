@@ -89,6 +89,7 @@ def test_a_target_moves_the_cost_and_not_the_obstacles():
     assert_close(alike.running(x, torch.ones(20, 1)), cost.running(x, torch.ones(20, 1)))
 
 
+@pytest.mark.gate
 def test_both_routes_find_the_same_optimum():
     pytest.importorskip("casadi")
     problem = problem_of(made(periodic=["angle"], obstacles=[BUMP]))

@@ -107,6 +107,7 @@ def test_what_misses_by_more_than_rounding_is_refused_with_the_nearest():
         problem_of(target={"output voltage": 15, "current": 0.6})
 
 
+@pytest.mark.gate
 def test_of_several_it_is_the_nearest_to_the_centre_and_others_are_listed(caplog):
     found = search(Tank(), [0.7], [1.9]).find({})
     assert len(found) == 1, "with its control free every level is one: a curve"
@@ -137,6 +138,7 @@ def test_a_point_that_is_found_again_is_the_same_in_units_of_its_controls_too():
     assert_close(torch.stack([point.u[0] for point in found]), 1e5 * torch.tensor([root, -root]), rtol=1e-9, atol=0)
 
 
+@pytest.mark.gate
 def test_limits_of_states_and_controls_choose():
     inside = {"lower": [-1.5, -1], "upper": [0.9, 1]}
     both = problem_of(system=Level(), target={"y": 0.1}, initial_states=inside)
@@ -159,6 +161,7 @@ def test_distances_are_in_units_of_x0_and_angles_are_modulo_a_turn():
     assert points.distance(torch.tensor([1.0 + 2 * math.pi, 0.0, 3.0, 0.0])) == pytest.approx(math.pi / 2), "no angle"
 
 
+@pytest.mark.gate
 def test_upright_is_nearer_than_hanging():
     upright, hanging = search(Cartpole(), [-1.0] * 4, [1.0] * 4).find({0: 0.5})
     assert_close(upright.x, torch.tensor([0.5, 0, 0, 0]), rtol=0, atol=1e-12)
@@ -196,6 +199,7 @@ def run(capsys, tmp_path, *arguments, **changes):
     return status, capsys.readouterr()
 
 
+@pytest.mark.gate
 def test_trim_prints_the_point(capsys, tmp_path):
     status, output = run(capsys, tmp_path, target={"output voltage": 15})
     assert status == 0

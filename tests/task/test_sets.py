@@ -68,6 +68,7 @@ def test_a_seed_names_the_samples(box):
     assert_close(box.float().sample(5, seeded(3)).double(), box.double().sample(5, seeded(3)), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.gate
 @given(st.integers(0, 2**32), st.floats(-1e3, 1e3, width=32), st.floats(0, 1e3, width=32))
 def test_samples_stay_in_the_box_in_single_precision(seed, low, width):
     box = Box([low], [low + width]).float()

@@ -114,7 +114,7 @@ def test_the_response_is_part_of_the_graph_where_one_is_recorded():
 
 
 @pytest.mark.parametrize("law", sample([SampledPolicy, LookaheadPolicy], 3))
-@pytest.mark.parametrize("method", TABLEAUX)
+@pytest.mark.parametrize("method", sample(TABLEAUX, 3))
 def test_a_held_law_with_the_true_value_function_is_the_best_of_its_problem(method, law):
     """Of a linear problem by fourth-order steps too; and the law of Euler steps is not that of others."""
     system = DoubleIntegrator()

@@ -90,6 +90,7 @@ def test_optima_are_the_same(both):
     assert not torch.allclose(nearby.hessian, riccati(problem_of(about.system, cost(), 40, 0.05)).hessian, rtol=1e-3)
 
 
+@pytest.mark.gate
 def test_the_transcription_agrees(both):
     pytest.importorskip("casadi")
     about, moved, x, _ = both
@@ -170,6 +171,7 @@ def test_networks_that_know_the_origin_know_the_target():
     problem.check_value_function(V)
 
 
+@pytest.mark.gate
 def test_what_a_cost_ignores_it_ignores_about_a_target():
     inner = QuadraticCost(torch.diag(torch.tensor([0.0, 1.0])), [[1.0]], torch.diag(torch.tensor([0.0, 1.0])))
     about = TargetCost(inner, [0.5, 0.0], [0.0])

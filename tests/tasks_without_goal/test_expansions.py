@@ -23,6 +23,7 @@ def found(request):
     return problem, torch.tensor(kept["optima"]), optima_from(problem, x0)
 
 
+@pytest.mark.gate
 def test_optima_against_the_transcription(found):
     _, optima, optimum = found
     assert ((optimum.path.cost - optima[:STATES]).abs() < 1e-3 * optima.std()).all()

@@ -1,5 +1,7 @@
 """Two formulations of each task without a goal, by us in torch and by us in CasADi, are the same task."""
 
+import functools
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from tests.tasks_without_goal.optima import AGREES, TASKS, Transcription
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, optima_of, problem_of, replay
 
 ALL = (*WORKING, *KEPT)
+problem = functools.cache(problem_of)  # checking where its functions are defined takes most of the time of these tests
 
 
 def misses(name, controls=None):
@@ -19,7 +22,7 @@ def misses(name, controls=None):
     kept = optima_of(name)
     controls = kept["controls"] if controls is None else controls
     optima = torch.tensor(kept["optima"])
-    J = replay(problem_of(name), kept["states"][: len(controls)], controls).J
+    J = replay(problem(name), kept["states"][: len(controls)], controls).J
     return (J - optima[: len(controls)]) / optima.abs().max()
 
 
@@ -37,7 +40,7 @@ def test_other_controls_cost_more(name):
 
 
 def breaks_a_limit(name, controls):
-    return bool((replay(problem_of(name), optima_of(name)["states"][: len(controls)], controls).h > 1e-6).any())
+    return bool((replay(problem(name), optima_of(name)["states"][: len(controls)], controls).h > 1e-6).any())
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -60,7 +63,7 @@ def test_optimal_controls_keep_every_limit(name):
 
 @pytest.mark.parametrize("name", ALL)
 def test_the_states_are_of_X0(name):
-    states, box = torch.tensor(optima_of(name)["states"]), problem_of(name).initial_states
+    states, box = torch.tensor(optima_of(name)["states"]), problem(name).initial_states
     assert states.shape == (64, len(box.lower))
     assert bool(((states >= box.lower - 1e-6) & (states <= box.upper + 1e-6)).all())
 
@@ -68,9 +71,8 @@ def test_the_states_are_of_X0(name):
 # −amount · volume and its slope vanish at the origin, and on all of X₀, where nothing is secreted yet.
 @pytest.mark.parametrize("name", sample(ALL, 4))
 def test_no_task_has_a_goal(name):
-    problem = problem_of(name)
-    problem.check()
-    assert problem.no_goal
+    problem(name).check()
+    assert problem(name).no_goal
 
 
 def test_the_readme_and_the_page_name_every_task():

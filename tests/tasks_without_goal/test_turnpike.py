@@ -22,6 +22,7 @@ def test_least_costs_are_those_of_the_task(years):
     assert torch.allclose(found.J, optima.cost, rtol=1e-9, atol=0)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("years", "stays"), [("80", True), ("20", False)])
 def test_optima_of_a_long_horizon_share_their_middle(years, stays):
     """From both ends of X₀; twenty years are too few to save that much."""

@@ -33,6 +33,7 @@ def _cache(tmp_path, monkeypatch):
     monkeypatch.setattr("lyapnet.training.figure_logger.figures_of", lambda learner: {})
 
 
+@pytest.mark.gate
 def test_without_a_compiler_a_run_says_so_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(compilation, "has_compiler", lambda: False)
     assembly.library.cache_clear()
@@ -142,6 +143,7 @@ class Branching(FCN):
     value_and_state_gradient = ValueFunction.value_and_state_gradient
 
 
+@pytest.mark.gate
 def test_what_cannot_be_traced_says_so_once(tmp_path, monkeypatch, capsys, caplog):
     monkeypatch.setitem(NETWORKS, "fcn", Branching)
     assert train(tmp_path, capsys, "network.name=fcn", "rollout.compile=on") == (False, [])

@@ -15,6 +15,7 @@ from lyapnet.training import lost_states
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.lost_states import MAX_LOST_STATES, MIN_EXCESS, SEARCHED_STATES, excess
 from lyapnet.training.validation_optimum import COMPARED_STATES
+from tests.marks import sample
 from tests.problems import problem_of
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, values, without_figures
 
@@ -145,7 +146,7 @@ def _diverges():
     lost_states._excess_of = diverging
 
 
-@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize("seeds", sample([1, 2], 2))
 def test_of_many_validation_states_the_first_are_compared_with_their_optimum(seeds, tmp_path):
     evaluation = {**SMALL["evaluation"], "validation_states": COMPARED_STATES + 6}
     desk = trained(tmp_path, seeds=seeds, evaluation=evaluation, training={**SMALL["training"], "iterations": 1})

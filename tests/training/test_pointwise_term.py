@@ -56,6 +56,7 @@ def test_the_loss_has_the_term_with_its_weight():
     assert any(not torch.allclose(a, b, rtol=1e-3) for a, b in zip(gradients, others, strict=True))
 
 
+@pytest.mark.gate
 def test_a_member_of_an_ensemble_has_the_points_of_its_seed():
     discrete = ["rollout.gradient=discrete", "rollout.compile=off"]
     member, gradients = one_step("seed=3", "seeds=2", *discrete)

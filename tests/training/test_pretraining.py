@@ -138,6 +138,7 @@ def learner_of(problem, value_scale):
     return Learner(problem, V, Rollout(problem, SampledPolicy(problem, V), gradient="discrete"), ValueProgram())
 
 
+@pytest.mark.gate
 def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     problem, seen, unseen = swing
     examples, others = (draw_examples(problem, optimum, GENERATOR) for optimum in (seen, unseen))
@@ -149,6 +150,7 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     assert after[1] < before[1] / 20
 
 
+@pytest.mark.gate
 def test_a_fit_does_not_depend_on_the_pace_of_the_machine_unless_time_runs_out(problem, monkeypatch):
     """The twin: where time runs out, the learning rate falls sooner."""
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
@@ -251,6 +253,7 @@ def test_near_states_are_no_further_than_their_expansion_is_believed(swing, monk
     assert furthest() == pytest.approx(anyhow / 5)
 
 
+@pytest.mark.gate
 def test_where_no_law_is_finite_a_fit_leaves_the_weights(swing, monkeypatch):
     problem, seen, _ = swing
     learner, x = learner_of(problem, 1.0), torch.randn(5, 2)

@@ -74,6 +74,7 @@ def test_without_divergence_nothing_goes_back(config, capsys):
     assert read_checkpoint(run.last)["lyapnet"]["rate_share"] == 1
 
 
+@pytest.mark.gate
 def test_it_goes_on_from_the_last_checkpoint_with_a_smaller_rate(config, capsys, monkeypatch):
     untroubled, _ = run_of(config, capsys)
     Breaks(monkeypatch, [7])  # the step after 6, with last.ckpt at 4
@@ -89,6 +90,7 @@ def test_it_goes_on_from_the_last_checkpoint_with_a_smaller_rate(config, capsys,
     assert len(steps) == len(set(steps))
 
 
+@pytest.mark.gate
 def test_before_the_first_checkpoint_it_goes_back_to_its_start(config, capsys, monkeypatch):
     Breaks(monkeypatch, [3])
     run, out = run_of(config, capsys)
@@ -158,6 +160,7 @@ def test_under_noise_a_rise_within_the_spread_of_costs_is_no_divergence(noise, c
         validate(4.0)
 
 
+@pytest.mark.gate
 def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
     Breaks(monkeypatch, [7])
     run, _ = run_of(config, capsys)

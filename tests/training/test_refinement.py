@@ -102,6 +102,7 @@ def no_training(monkeypatch):
     monkeypatch.setattr(experiment, "fit", lambda *_: pytest.fail("Expected no training."))
 
 
+@pytest.mark.gate
 def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     checkpoint, certificate = refine(run)
     folder = run / "refine_1"
@@ -129,6 +130,7 @@ def test_a_region_is_refined_with_the_weight_of_its_program(tmp_path):
     assert load_config(run / "refine_1/config.yaml").pointwise.weight == RegionProgram.pointwise
 
 
+@pytest.mark.gate
 def test_its_points_fail_the_condition_or_are_undecided(run):
     """By plain arithmetic, at the controller that failed."""
     condition = DecreaseCondition(lyapnet.load(best(run)).closed_loop.double(), ALPHA, DELTA)
@@ -384,6 +386,7 @@ def test_a_round_that_lies_there_is_trained_with_nothing_that_it_names(what, run
     assert not own("trap")
 
 
+@pytest.mark.gate
 def test_parts_from_python_are_trained_with(run):
     """Also where their class cannot be imported; and their name stands in for what the checkpoint said."""
 

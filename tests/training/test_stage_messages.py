@@ -34,6 +34,7 @@ def test_a_log_has_a_line_for_each_stage_and_never_is_silent_for_long(monkeypatc
     assert isinstance(report, StageReport)
 
 
+@pytest.mark.gate
 def test_a_stage_that_takes_long_has_a_line_and_a_quick_one_has_none(log):
     with StageMessages(Console(file=log), "sound", patience=0.6, first=0.3) as report:
         report("importing torch")

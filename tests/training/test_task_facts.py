@@ -35,6 +35,7 @@ def module_of(name):
     return build_module(load_config(SCRATCH / f"{name}.yaml"))
 
 
+@pytest.mark.gate
 def test_finetuning_keeps_the_new_cost_and_system(without_figures, tmp_path):
     source = trained("double_integrator_value", tmp_path)
     new = ["cost.Q=[1, 1]", "cost.Q_T=[100, 1]", "system.parameters.mass=2"]

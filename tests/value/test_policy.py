@@ -274,6 +274,7 @@ def test_the_lookahead_law_is_the_best_held_control_where_V_is_steep(held):
     assert problem.controls.contains(POLICIES["lookahead"](problem, V)(t, x)).all()
 
 
+@pytest.mark.gate
 def test_the_lookahead_law_of_two_limited_controls_is_the_best_of_a_grid():
     """With a coupled R, and a V that is not convex: where Q is not, the law still lowers what the sampled one pays."""
     system = Linear([[0.0, 1.0], [-1.0, 0.3]], [[1.0, 0.2], [0.0, 1.0]])

@@ -132,6 +132,7 @@ def test_what_follows_the_end_is_as_the_page_has_it(monkeypatch, capsys):
         assert record["held"] == noted["held"] == (0 if name == "bryson_denham" else 64)
 
 
+@pytest.mark.gate
 def test_what_follows_the_end_is_found_again(tmp_path, monkeypatch):
     """Not taken from the checkpoint; and what is recorded is of other closed loops than those of the choice."""
     path = tmp_path / "one.ckpt"
@@ -155,6 +156,7 @@ def test_every_export_is_its_controller(name, precision, bound):
     assert all(max(one["control"], one["value"]) < bound for one in agreements.values())
 
 
+@pytest.mark.gate
 def test_a_command_takes_one(capsys):
     assert main(["evaluate", f"zoo:{ONE}", "--samples", "2", "--no-optimum", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["samples"] == 2

@@ -308,6 +308,7 @@ def test_what_cannot_be_exported_is_refused(make, name, to, error, message, tmp_
     assert (tmp_path / "file").read_text() == "kept"
 
 
+@pytest.mark.gate
 def test_what_onnxruntime_lacks_is_named(tmp_path):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")

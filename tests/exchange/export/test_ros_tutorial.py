@@ -115,6 +115,7 @@ def test_it_stops_at_a_first_state_that_is_none(run):
     assert len(log) == 1
 
 
+@pytest.mark.gate
 @needs_compilers
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_the_package_builds_and_installs(package, tmp_path):

@@ -146,6 +146,7 @@ class Brake(ControlAffineSystem):
 """
 
 
+@pytest.mark.gate
 def test_a_state_that_nothing_depends_on_is_left_out(tmp_path, capsys, monkeypatch):
     """A brake of the user's own: V = v², u = −v, wherever it is."""
     (tmp_path / "brake_of_mine.py").write_text(BRAKE, encoding="utf-8")

@@ -132,6 +132,7 @@ def limited():
     return problem, x0, optimal_trajectories(problem, x0, still(problem, 5))
 
 
+@pytest.mark.gate
 def test_optima_within_limits_against_ipopt(limited, swings):
     pytest.importorskip("casadi")
     problem, x0, optimum = limited

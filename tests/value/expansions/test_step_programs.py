@@ -21,6 +21,7 @@ from lyapnet.value.expansions import (
     path_under,
 )
 from lyapnet.value.expansions.step_programs import StepPrograms
+from tests.marks import sample
 
 SIZES = (1.0, 0.25)
 
@@ -71,7 +72,7 @@ def test_line_searches_are_closed_loops_of_their_law(system, kernel, b):
     assert not torch.allclose(found.cost[0], found.cost[1]), "the step sizes lead elsewhere"
 
 
-@pytest.mark.parametrize("b", [1, 16, 37])
+@pytest.mark.parametrize("b", sample([16, 1, 37], 3))
 @pytest.mark.parametrize(("system", "kernel"), [(Pendulum, ScanKernel), (Looking, type(None))])
 def test_each_state_follows_the_law_of_an_expansion_of_its_own(system, kernel, b):
     problem, generator = swinging(system()), torch.Generator().manual_seed(0)
@@ -89,7 +90,7 @@ def test_each_state_follows_the_law_of_an_expansion_of_its_own(system, kernel, b
         assert not torch.allclose(follow_expansions(problem, turned, x[0]).cost, found.cost), "the twin: of another"
 
 
-@pytest.mark.parametrize("rows", [1, 512, 700])
+@pytest.mark.parametrize("rows", sample([512, 1, 700], 3))
 @pytest.mark.parametrize(("system", "kernel"), [(Pendulum, NumberKernel), (Looking, type(None))])
 def test_derivatives_are_those_of_autograd(system, kernel, rows):
     problem = swinging(system())
@@ -110,6 +111,7 @@ def test_derivatives_are_those_of_autograd(system, kernel, rows):
     assert_close(bends[k], of.hessian(lambda z: F(z) @ p[k], z[k]), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.gate
 def test_copies_of_a_problem_share_its_programs_and_other_steps_have_their_own():
     problem = swinging()
     one = StepPrograms(problem, SIZES).first(torch.ones(3, 3, dtype=torch.float64))
@@ -122,6 +124,7 @@ def test_copies_of_a_problem_share_its_programs_and_other_steps_have_their_own()
     assert pickle.loads(pickle.dumps(problem)).findings.programs == {}, "a program belongs to its process"
 
 
+@pytest.mark.gate
 def test_tensors_of_a_problem_may_change():
     problem = swinging(Pendulum())
     z = torch.ones(3, 3, dtype=torch.float64)

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.gate import Part, kept_together
+from tests.gate import PARTS, Part, kept_together
 from tests.pages import ROOT
 
 FILES = {
@@ -110,7 +110,7 @@ def test_commits_in_a_row_have_all_parts(tmp_path):
 
     git("init", "--quiet", "--initial-branch", "main")
     parts = []
-    for k in range(5):
+    for k in range(PARTS + 1):
         if k == 3:
             git("checkout", "--quiet", "-b", "aside")
             for _ in range(2):
@@ -120,8 +120,10 @@ def test_commits_in_a_row_have_all_parts(tmp_path):
         else:
             git("commit", "--quiet", "--allow-empty", "-m", f"commit {k}")
         parts.append(part())
-    assert sorted(parts[:4]) == ["1/4", "2/4", "3/4", "4/4"]
-    assert parts[4] == parts[0]
+    assert sorted(parts[:PARTS]) == [f"{k}/{PARTS}" for k in range(1, PARTS + 1)]
+    assert parts[PARTS] == parts[0]
     assert part("1/1") == "1/1"
     subprocess.run(["git", "clone", "--quiet", "--depth", "1", f"file://{tmp_path}", tmp_path / "shallow"], check=True)
-    assert Part.parse(part(place=tmp_path / "shallow")).of == 4  # by the hash of the commit: its number is not known
+    assert (
+        Part.parse(part(place=tmp_path / "shallow")).of == PARTS
+    )  # by the hash of the commit: its number is not known

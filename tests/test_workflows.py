@@ -7,6 +7,7 @@ import tomllib
 import pytest
 import yaml
 
+from tests.gate import PARTS
 from tests.pages import README, ROOT, blocks
 
 WORKFLOWS = {path.stem: yaml.safe_load(path.read_text("utf-8")) for path in ROOT.glob(".github/workflows/*.yml")}
@@ -46,7 +47,7 @@ def test_the_commands_are_those_of_the_readme():
 def test_all_parts_of_the_gate_are_run():
     job = WORKFLOWS["tests"]["jobs"]["all"]
     assert ALL in commands(job)
-    assert job["strategy"]["matrix"]["part"] == [f"{k}/4" for k in (1, 2, 3, 4)]
+    assert job["strategy"]["matrix"]["part"] == [f"{k}/{PARTS}" for k in range(1, PARTS + 1)]
 
 
 def test_the_site_is_built_as_the_pages_say():

@@ -198,6 +198,7 @@ LONG = (
     "test_false_attempts.py", "test_runs.py", "test_regions.py", "test_compare.py", "test_evil_files.py",
     "test_export.py", "test_operators.py", "test_kept_regions.py", "test_rules.py", "test_constraints.py",
     "test_start.py", "test_negative_controls.py", "test_readme.py", "test_settling.py", "test_refinement.py",
+    "test_view.py", "test_kept_sides.py", "test_distributed.py", "test_family.py",
 )  # fmt: skip
 
 

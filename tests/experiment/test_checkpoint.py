@@ -437,7 +437,6 @@ def test_writes_at_the_same_time_do_not_meet(content, path, monkeypatch):
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
-@pytest.mark.gate
 def test_kill_while_writing_keeps_the_previous_checkpoint_and_the_next_write_tidies_up(path, content):
     before = path.read_bytes()
     killed = subprocess.run([sys.executable, "-c", KILLED_WHILE_WRITING, path], check=False)

@@ -470,7 +470,7 @@ class Timed(FCN):
     value_and_state_gradient = ValueFunction.value_and_state_gradient
 
 
-@pytest.mark.parametrize("change", ["nothing", "stiffness", "wind", "late"])
+@pytest.mark.parametrize("change", sample(["nothing", "stiffness", "wind", "late"], 2))
 def test_code_is_held_against_a_loop_far_from_the_centre_and_late(change, monkeypatch):
     monkeypatch.setitem(SYSTEMS, "pendulum", Walled)
     monkeypatch.setitem(NETWORKS, "fcn", Timed)

@@ -33,6 +33,7 @@ from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.elementary_functions import Elementary
 from lyapnet.prover.operators import complaints, forget, has_bounds, register
 from lyapnet.prover.simplification import COPIES
+from tests.marks import sample
 from tests.pages import PAGES, ROOT, blocks
 
 aten = torch.ops.aten
@@ -132,7 +133,7 @@ def test_the_kernel_for_numbers_is_torch(name):
 
 
 @needs_c
-@pytest.mark.parametrize("name", read_by("C"))
+@pytest.mark.parametrize("name", sample(read_by("C"), 4))
 def test_c_is_torch(name, tmp_path):
     assert are_equal(by_c(OPERATORS[name], tmp_path), OPERATORS[name])
 

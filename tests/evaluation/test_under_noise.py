@@ -229,6 +229,7 @@ def test_a_rollout_takes_a_seed_or_increments():
 
 
 @pytest.mark.parametrize("noise", [-1, 1.5, True, torch.tensor(0), torch.zeros(30, 2, 1), np.zeros((29, 1, 1)), "0"])
+@pytest.mark.usefixtures("as_users_call")
 def test_noise_of_another_kind_or_shape_is_one_line(noise):
     with pytest.raises(ValueError, match=r"Expected noise as a seed ≥ 0, or as ΔW of shape \(30, 1, 1\)"):
         controller_of(task()).rollout(torch.zeros(1, 2), noise=noise)

@@ -289,6 +289,7 @@ def test_an_operator_without_bounds_makes_up_none():
         register(SOFT, lambda operators, x, y: operators.logaddexp2(x, y))
 
 
+@pytest.mark.gate
 @needs_compiler
 def test_a_kernel_from_before_goes_on(registered):
     before = NumberKernel(trace(lambda x: (x.sin().sum() * x,), (torch.ones(3),)), (torch.ones(3),))
@@ -441,6 +442,7 @@ def test_the_file_in_which_a_bound_is_written_joins_what_a_proof_depends_on(tmp_
     assert own.files() == []
 
 
+@pytest.mark.gate
 @needs_c
 @needs_compiler
 def test_a_row_registered_after_a_first_trace_is_read_too(registered, tmp_path):

@@ -416,6 +416,7 @@ ERFINV = Operator("erfinv", domain=((-0.9, 0.9),))
     ],
     ids=["None", "operands", "no numbers", "wrong", "kind"],
 )
+@pytest.mark.usefixtures("as_users_call")
 def test_a_registration_that_fails_leaves_no_rule(row, bound, kind, says):
     with pytest.raises(UsageError, match=says):
         register(row, bound, kind)

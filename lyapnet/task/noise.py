@@ -99,3 +99,8 @@ class SystemNoise(Noise):
 
     def forward(self, x: State) -> NoiseMatrix:
         return self.system.noise(x)  # pyright: ignore[reportCallIssue]
+
+
+def once_if_constant(sigma: NoiseMatrix) -> Tensor:
+    """σ with axes of length one for those of the batch along which it is expanded, so that it enters products once."""
+    return sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]

@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--paths", type=int, default=PATHS, help=f"paths from each of {STATES} states")
     parser.add_argument("--certainty", action="store_true", help="compare with the law of the task without its noise")
     parser.add_argument("--folder", type=Path, help="keep the runs there")
-    given = parser.parse_args()
+    given = parser.parse_intermixed_args()  # changes may stand before or after options
     task = TASKS[given.name]
     with tempfile.TemporaryDirectory(prefix=f"{given.name}_") as temporary:
         place = given.folder or Path(temporary)

@@ -9,7 +9,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import PerState, State, StatePath, StepPath, Time, Times, ValuePath
-from lyapnet.task.noise import Increments, Noise
+from lyapnet.task.noise import Increments, Noise, once_if_constant
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.risk import risk_matrix
 
@@ -55,11 +55,6 @@ def certainty_equivalent(
     excess = risk * (V(t, mean + steps) - model)
     tilted = c + (w * slope).sum(-1) / 2 - root.diagonal(0, -2, -1).log().sum(-1) / risk
     return tilted + (torch.logsumexp(excess, 0) - math.log(len(steps))) / risk
-
-
-def once_if_constant(sigma: NoiseMatrix) -> Tensor:
-    """σ with axes of length one for those of the batch along which it is expanded, so that it enters products once."""
-    return sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]
 
 
 def sampled_value(

@@ -28,7 +28,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import is_positive_definite, solve
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 from lyapnet.task.cost import PenaltyCost, spread
-from lyapnet.task.noise import Noise
+from lyapnet.task.noise import Noise, once_if_constant
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
 from lyapnet.value.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
@@ -306,14 +306,16 @@ def backward_recursion(
     M = torch.cat([one, torch.cat([(steps.F - x[1:])[..., None], steps.F_z], -1)], -2)
     L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
     W = _quadratic(*steps.end)
-    S = None if noise is None else _noise_maps(problem, noise, x[:-1])
+    spread, S = (None, None) if noise is None else _spread_and_maps(problem, noise, x[:-1])
     sigma = None if noise is None or not problem.risk else noise(x[:-1])
     nodes, gains = [W], []
     for k in reversed(range(len(M))):
         later = W if sigma is None else with_risk(W, sigma[k], problem.horizon.dt, problem.risk)
         Q = L[k] + M[k].mT @ later @ M[k]
+        if spread is not None:
+            Q[..., 0, 0] += (W[..., 1:, 1:] * spread[k]).sum((-2, -1))
         if S is not None:
-            Q = Q + (S[k].mT @ W[..., None, 1:, 1:] @ S[k]).sum(-3)
+            Q[..., : 1 + n, : 1 + n] += (S[k].mT @ W[..., None, 1:, 1:] @ S[k]).sum(-3)
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
         regularised = _regularised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
         gain = _gains(problem, u[k], regularised, Q_ua)
@@ -326,17 +328,22 @@ def backward_recursion(
     return Backward(gain[..., 0], gain[..., 1:], expansion, steps.replaced)
 
 
-def _noise_maps(problem: Problem, noise: Noise, x: StatePath) -> Tensor:
-    """√Δt (σ_j, ∂σ_j/∂x, 0), (N, *batch, k, n, 1 + n + m), for each column σ_j of σ: (1, δx, δu) ↦ its displacement.
+def _spread_and_maps(problem: Problem, noise: Noise, x: StatePath) -> tuple[Tensor | None, Tensor | None]:
+    """(Δt σσᵀ, None) for a constant σ, else (None, S): √Δt (σ_j, ∂σ_j/∂x), (N, *batch, k, n, 1 + n).
 
-    Where σ has no finite slope, as √x at 0, it is taken as constant.
+    S maps (1, δx) to the displacement by each column σ_j of σ. Where σ has no finite slope, as √x at 0, it is taken as
+    constant.
     """
+    dt = problem.horizon.dt
     with torch.enable_grad():
         z = x.detach().requires_grad_()
         sigma = noise(z).mT  # (N, *batch, k, n)
+        if not sigma.requires_grad:
+            once = once_if_constant(noise(x))
+            return (dt * once @ once.mT).expand(len(x), *[-1] * x.ndim), None
         slope = jacobian(sigma.flatten(-2), z).unflatten(-2, sigma.shape[-2:])
-    slope, none = slope.nan_to_num(0.0, 0.0, 0.0), x.new_zeros(*sigma.shape, problem.system.m)
-    return math.sqrt(problem.horizon.dt) * torch.cat([sigma[..., None], slope, none], -1).detach()
+    maps = torch.cat([sigma[..., None], slope.nan_to_num(0.0, 0.0, 0.0)], -1)
+    return None, math.sqrt(dt) * maps.detach()
 
 
 def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:

@@ -22,6 +22,8 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Path, in_float64, path_of, path_under
 from lyapnet.value.policy import LookaheadPolicy
 
+MIN_SAMPLE_SIZE = 0.5  # share of a batch under noise with risk, below which its cost has no derivative
+
 
 class Learner(nn.Module):
     """V, the closed loop of its policy, and the program that is minimised.
@@ -167,14 +169,19 @@ class Learner(nn.Module):
 
         The derivative of (1/θ) log E exp(θJ) is the mean of that of J with these weights. Under noise they are
         exp(θ Σ D_n), see Trajectory.compensated, on random plants exp(θ (J − V(0, x₀))); both with a mean of one.
+
+        Under noise with a strong risk a few of the weights are all that counts, and the derivative is a matter of
+        chance: with an effective sample size (Σw)²/Σw² below MIN_SAMPLE_SIZE of the batch all weights are zero. V then
+        learns from its residuals alone, which hold on every path.
         """
-        if isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None:
-            excess, others = trajectory.surprise.sum(0), slice(None)
-        else:
-            excess, others = trajectory.cost - trajectory.require_value()[0], ON_PLANTS
-        weights = torch.ones_like(excess)
-        weights[others] = len(excess[others]) * torch.softmax(self.problem.risk * excess[others], 0)
-        return weights
+        if not (isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None):
+            excess = trajectory.cost - trajectory.require_value()[0]
+            weights = torch.ones_like(excess)
+            weights[ON_PLANTS] = len(excess[ON_PLANTS]) * torch.softmax(self.problem.risk * excess[ON_PLANTS], 0)
+            return weights
+        share = torch.softmax(self.problem.risk * trajectory.surprise.sum(0), 0)
+        enough = 1 / share.square().sum() >= MIN_SAMPLE_SIZE * len(share)
+        return len(share) * share * enough
 
     def _spread_of_optima(self, cost: PerState) -> Tensor | None:
         """The spread of the optima, which makes losses of different steps comparable; None for a task with a goal.

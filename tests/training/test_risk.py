@@ -44,20 +44,27 @@ def test_under_noise_dear_loops_count_more():
     assert isinstance(trajectory, NoisyTrajectory)
     assert trajectory.surprise is not None
     # an untrained V expects almost everything: surprises as those of a trained one
-    trajectory.surprise = torch.randn(trajectory.surprise.shape, generator=torch.Generator().manual_seed(1)) / 100
+    trajectory.surprise = torch.randn(trajectory.surprise.shape, generator=torch.Generator().manual_seed(1)) / 200
     weights, surprise = learner._weights(trajectory), trajectory.surprise.sum(0)
     assert_close(weights.mean(), torch.tensor(1.0))
     assert (weights.argsort() == surprise.argsort()).all()
     assert_close(weights.log().diff(), 20 * surprise.diff(), atol=1e-4, rtol=1e-4)
-    learner.train_on(trajectory)
-    assert learner.output is not None
     compensated = trajectory.compensated()
-    assert_close(learner.output.trajectory_cost, (weights * compensated.cost).mean().detach())
-    assert abs(float(learner.output.trajectory_cost - compensated.cost.mean().detach())) > 1e-4
-    indifferent = learner_of(**NOISE)
-    indifferent.train_on(trajectory)
-    assert indifferent.output is not None
-    assert_close(indifferent.output.trajectory_cost, compensated.cost.mean().detach())
+    derivative = torch.autograd.grad(
+        learner.program(compensated, weights=weights).trajectory_cost, compensated.terminal_cost, retain_graph=True
+    )[0]
+    assert_close(derivative, weights / len(weights))
+    (indifferent,) = torch.autograd.grad(learner.program(compensated).trajectory_cost, compensated.terminal_cost)
+    assert_close(indifferent, torch.ones_like(weights) / len(weights))
+
+
+def test_where_a_few_loops_are_all_that_counts_the_cost_has_no_derivative():
+    learner = learner_of(**NOISE, risk=20.0)
+    trajectory = learner.roll_out(states(learner), 0)
+    assert isinstance(trajectory, NoisyTrajectory)
+    for spread, some in ((0.005, True), (1.0, False)):  # of θ Σ D_n: about 0.45 and 90
+        trajectory.surprise = spread * torch.randn(20, 32, generator=torch.Generator().manual_seed(1))
+        assert bool((learner._weights(trajectory) > 0).any()) == some
 
 
 def test_of_random_plants_the_dear_ones_count_more_and_the_model_as_before():

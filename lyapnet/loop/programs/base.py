@@ -78,14 +78,17 @@ class Program(ABC):
             spread_of_costs: replaces the mean cost in a task without a goal; None for a task with a goal.
             on_model: the trajectories of the model. Of others, on plants that differ, only the cost J counts, since V
                 is the value function of the model.
-            weights: those of the trajectories in the mean of J, with a mean of one; None: all one.
+            weights: those of the trajectories in the derivative of the mean of J; None: all one.
 
         Raises:
             ValueError: no V defines the control law.
             DivergenceError: a term is not finite; names the term and the initial state.
         """
         values = trajectory.require_value()
-        J = (trajectory.cost if weights is None else weights * trajectory.cost).mean()
+        J = trajectory.cost.mean()
+        if weights is not None:
+            weighted = (weights * trajectory.cost).mean()
+            J = J.detach() + (weighted - weighted.detach())
         per_state = self.per_state(values, trajectory)
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)

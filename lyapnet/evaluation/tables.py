@@ -89,7 +89,9 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
             "infinite" if level is None else f"{level:.4g}" for level in levels.values()
         ),
         **(
-            {"… mean of the dearest 5 %": measured_or_not("", noise["dearest_mean"])} if "dearest_mean" in noise else {}
+            {"… mean of the dearest 5 % of the paths from a state": measured_or_not("", noise["dearest_mean"])}
+            if "dearest_mean" in noise
+            else {}
         ),
         "paths lost, which cost half more than V and not by their noise": f"{noise['lost_fraction']:.2%}",
     }

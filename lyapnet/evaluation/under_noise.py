@@ -20,7 +20,7 @@ from lyapnet.value.risk import mean_with_risk
 
 CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
-DEAREST = 0.05  # share of paths whose mean cost measures the risk
+DEAREST = 0.05  # share of a state's paths whose mean cost measures its risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
 
@@ -38,7 +38,7 @@ class NoiseMeasures(NamedTuple):
     plain_mean: float  # mean of J itself
     plain_half_width: float  # of its 95 % interval
     quantiles: dict[str, float]  # of J over all states and paths, by probability
-    dearest_mean: float  # mean of J over the dearest 5 % of all states and paths (conditional value at risk)
+    dearest_mean: float  # mean of J over the dearest 5 % of the paths from a state, averaged over the states
     lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
     risk: float  # θ
     with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ), from above; None if θ = 0
@@ -81,7 +81,7 @@ def measure_under_noise(
     measures = NoiseMeasures(
         paths, float(cost.mean()), _half_width(cost), float(J.mean()), _half_width(J),
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
-        float(J.flatten().double().topk(math.ceil(DEAREST * J.numel())).values.mean()),
+        float(_mean_of_dearest(J).mean()),
         float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
         problem.risk, float(with_risk.mean()) if problem.risk else None,
         _half_width(with_risk) if problem.risk else None,
@@ -97,6 +97,16 @@ def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor], r
     own, other = (mean_with_risk(torch.stack(each), risk) for each in (J, others))
     difference = other - own
     return torch.where(difference.isfinite(), cost + difference, other)
+
+
+def _mean_of_dearest(J: Tensor) -> PerState:
+    """The conditional value at risk of each state: the mean of its DEAREST share of paths, of J (paths, states).
+
+    A path that lies only in part within this share counts in part.
+    """
+    count = DEAREST * len(J)
+    share = (count - torch.arange(len(J)).to(J)).clamp(0, 1)[: math.ceil(count)]
+    return (J.sort(0, descending=True).values[: len(share)] * share[:, None]).sum(0) / count
 
 
 def _half_width(samples: Tensor) -> float:

@@ -18,7 +18,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.tables import evaluation_table
-from lyapnet.evaluation.under_noise import _half_width, measure_under_noise
+from lyapnet.evaluation.under_noise import _half_width, _mean_of_dearest, measure_under_noise
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.rollout import Rollout
@@ -143,7 +143,7 @@ def test_with_risk_costs_are_certainty_equivalents_those_of_the_oracle():
     assert abs(float((table.cost - optimum).mean())) < 2 * noise.with_risk_half_width < 0.02 * float(optimum.mean())
     assert_close(float(table.cost.mean()), assumed)
     assert assumed > noise.mean + 2 * noise.half_width
-    assert noise.dearest_mean > noise.quantiles["95%"]
+    assert noise.dearest_mean > noise.plain_mean
     assert lqr is not None
     assert_close(lqr, table.cost)
     # the law without risk costs less on the mean, and more with the risk
@@ -154,6 +154,13 @@ def test_with_risk_costs_are_certainty_equivalents_those_of_the_oracle():
     assert worse.with_risk is not None
     assert worse.with_risk > assumed
     assert worse.mean < noise.mean
+    assert worse.dearest_mean > noise.dearest_mean
+
+
+def test_the_dearest_paths_count_in_part():
+    """Of 30 paths 1.5 are the dearest 5 %."""
+    J = torch.arange(30.0)[:, None] * torch.tensor([1.0, 2.0])
+    assert_close(_mean_of_dearest(J.flip(0)), torch.tensor([1.0, 2.0]) * (29 + 0.5 * 28) / 1.5)
 
 
 def test_the_summary_names_the_risk():

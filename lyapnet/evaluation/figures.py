@@ -24,6 +24,7 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
+MOST_PANELS = 12  # states, and controls, that a figure over time has a panel for
 MOST_NAMED = 4  # other states whose values fit into a line under a slice
 
 
@@ -150,6 +151,18 @@ def _draw_line_region(
     legend_below(figure, [*axes.get_legend_handles_labels()[0], *twin.get_legend_handles_labels()[0]], columns=3)
 
 
+def states_and_controls_to_draw(system: ControlAffineSystem) -> tuple[list[int], list[int]]:
+    """The indices of the first MOST_PANELS states that move, and of the first MOST_PANELS controls."""
+    moving = [i for i in range(system.n) if i not in system.constants]
+    return moving[:MOST_PANELS], list(range(system.m))[:MOST_PANELS]
+
+
+def name_panels_left_out(figure: Figure, system: ControlAffineSystem) -> None:
+    """Say above a figure how many states and controls have no panel, if there are some."""
+    if max(system.n - len(system.constants), system.m) > MOST_PANELS:
+        figure.suptitle(f"of {system.n} states and {system.m} controls the first {MOST_PANELS} each", fontsize=9)
+
+
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     """States, controls and their limits, V and the cost to go over time, for a batch (b,) of closed loops.
 
@@ -157,14 +170,14 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
-    drawn = [i for i in range(system.n) if i not in system.constants]
+    drawn, controls = states_and_controls_to_draw(system)
     x0 = trajectory.x[0]
     goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # in a family each member has its own
     one = torch.where((goal - goal[0]).abs().amax(0) <= 1e-9 * (1 + goal[0].abs()), goal[0], torch.nan)
     one = one if problem.has_goal else torch.full_like(one, torch.nan)
-    at_rest = torch.cat([one, problem.rest]).tolist()
+    at_rest = torch.cat([one, problem.rest[controls]]).tolist()
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
-    curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
+    curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in controls]
     columns = _columns(len(curves) + 1)
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # fits a page without scaling
@@ -177,9 +190,11 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     for part in parts_of(problem.constraints):
         if isinstance(part, StateLimits):
             for i, height in zip(part.states.tolist(), part.limits.tolist(), strict=True):
-                panels[drawn.index(i)].axhline(height, color=VERMILION, linewidth=0.9, linestyle="--")
+                if i in drawn:
+                    panels[drawn.index(i)].axhline(height, color=VERMILION, linewidth=0.9, linestyle="--")
     for limit in problem.controls.limits or ():
-        for panel, height in zip(panels[len(drawn) : len(curves)], limit.expand(system.m).tolist(), strict=True):
+        heights = limit.expand(system.m)[controls].tolist()
+        for panel, height in zip(panels[len(drawn) : len(curves)], heights, strict=True):
             if math.isfinite(height):
                 panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
     last = panels[len(curves)]
@@ -195,6 +210,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
         spare.set_visible(False)
     for panel in panels:
         panel.tick_params(labelsize=7)
+    name_panels_left_out(figure, system)
     for column in grid.T:
         lowest = [panel for panel in column if panel.get_visible()][-1]
         lowest.set_xlabel("time (s)", fontsize=8)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, legend_below, numpy_of
 from lyapnet.base.types import State
+from lyapnet.evaluation.figures import name_panels_left_out, states_and_controls_to_draw
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.problem import Problem
 
@@ -30,9 +31,9 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
     """
     system, t = problem.system, numpy_of(trajectory.t)
     to_go = trajectory.cost - trajectory.running_cost
-    drawn = [i for i in range(system.n) if i not in system.constants]
+    drawn, controls = states_and_controls_to_draw(system)
     curves = [(system.state_labels[i], trajectory.x[..., i]) for i in drawn]
-    curves += [(system.control_labels[i], trajectory.u[..., i]) for i in range(system.m)]
+    curves += [(system.control_labels[i], trajectory.u[..., i]) for i in controls]
     columns = 1 if len(curves) < 4 else 2
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(4.6 * columns, 1.5 * rows + 0.6), layout="constrained")
@@ -51,6 +52,7 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
         last.plot(t, numpy_of(trajectory.require_value()[..., k].mean(1)), color=GREY, ls="--", label="mean of V")
     last.set_ylabel("cost", fontsize=8)
     handles = [*panels[0].get_legend_handles_labels()[0], *last.get_legend_handles_labels()[0][:2]]
+    name_panels_left_out(figure, system)
     for spare in panels[len(curves) + 1 :]:
         spare.set_visible(False)
     for panel in panels:

@@ -10,10 +10,16 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from lyapnet.evaluation import figures
+from lyapnet.evaluation.noise_figure import bands, states_to_draw
 from lyapnet.evaluation.states import StateTable
 from lyapnet.experiment.assembly import build_problem, build_rollout, build_value_function
 from lyapnet.experiment.config import load_config
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.noise import StateNoise
+from lyapnet.task.systems import Linear
 from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import HJBPolicy
+from tests.problems import Quadratic, problem_of
 
 CONF = Path(__file__).parents[2] / "conf"
 TASKS = ("double_integrator", "cartpole_swingup", "reacher")
@@ -191,3 +197,23 @@ def test_optimality_is_drawn_where_the_optimum_is_known():
         line, states = axes.get_lines()
         assert list(line.get_xdata()) == list(line.get_ydata())
         assert states.get_xydata().tolist() == [[1.0, points[0]], [2.0, points[1]]]
+
+
+def test_of_many_states_the_first_have_a_panel_and_the_others_are_counted():
+    states, controls = 30, 15
+    system = Linear((-torch.eye(states)).tolist(), torch.eye(states)[:, :controls].tolist())
+    problem = problem_of(system, steps=5)
+    problem.noise = StateNoise([0.1] * states)
+    V = Quadratic(torch.eye(states))
+    rollout = Rollout(problem, HJBPolicy(problem, V), gradient="discrete")
+    x0 = problem.initial_states.sample(8, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        path = rollout(x0)
+        noisy = rollout(states_to_draw(x0), problem.noise.draw(5, 0.1, states_to_draw(x0), torch.Generator()))
+    for figure in (figures.trajectories(path, problem), bands(noisy, problem)):
+        shown = [axes for axes in figure.axes if axes.get_visible()]
+        assert len(shown) == 2 * figures.MOST_PANELS + 1
+        assert figure.get_suptitle() == "of 30 states and 15 controls the first 12 each"
+    few = problem_of(Linear([[0.0]], [[1.0]]), steps=5)
+    path = Rollout(few, HJBPolicy(few, Quadratic(torch.eye(1))), gradient="discrete")(torch.ones(2, 1))
+    assert figures.trajectories(path, few).get_suptitle() == ""

@@ -163,6 +163,7 @@ def prove_reach(
     n = problem.system.n
     target, avoided = _of_states(target, n), [_of_states(box, n) for box in avoided]
     _require_interior(target)
+    _require_away_from(problem.initial_states, target, avoided)
     condition = ReachDecrease(copied(closed_loop).requires_grad_(False), target, avoided, probability, named)
     require_smooth(condition, over_time(problem.initial_states, 0.0))
     goal, duration = problem.goal.double(), problem.horizon.duration
@@ -215,6 +216,18 @@ def _of_states(box: Box, n: int) -> Box:
 def _require_interior(target: Box) -> None:
     if not bool((target.widths > 0).all()):
         raise UsageError("Expected a target with an interior, got lower = upper; noise never meets a point.")
+
+
+def _require_away_from(initial_states: Box, target: Box, avoided: Sequence[Box]) -> None:
+    """Refuse a box to avoid in which closed loops begin that are not yet in the target."""
+    for box in avoided:
+        lower = torch.maximum(box.lower, initial_states.lower.double())
+        upper = torch.minimum(box.upper, initial_states.upper.double())
+        if (lower <= upper).all() and not ((target.lower <= lower) & (upper <= target.upper)).all():
+            raise UsageError(
+                f"Expected boxes to avoid outside X₀, got one that meets X₀ from {lower.tolist()} to {upper.tolist()}; "
+                "closed loops that begin there do not avoid it: make one of both smaller."
+            )
 
 
 def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budget, enough: float, unit: float) -> float:

@@ -234,11 +234,13 @@ def read_pushes(named: Sequence[str], option: str = "--disturbance STATE=W") -> 
         option: the option and its placeholder in the message.
 
     Raises:
-        UsageError: no number.
+        UsageError: no number, or a state stands there twice.
     """
     found = dict[str, float]()
     for text in named:
         name, _, value = text.partition("=")
+        if name in found:
+            raise UsageError(f"Expected {option} once for each state, got {name} twice; leave one of them out.")
         try:
             found[name] = float(value)
         except ValueError as error:

@@ -19,6 +19,7 @@ from lyapnet.claims import reach_decrease
 from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.checking import check
 from lyapnet.claims.reach import prove_reach
+from lyapnet.cli.options import read_pushes
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget
@@ -187,7 +188,7 @@ FALSE = {
     "a target beside the goal": lambda: {"target": Box([0.2, -0.7], [0.8, 0.7])},
     "a target outside of D": lambda: {"target": Box([3.0, -1.0], [4.0, 1.0])},
     "a box to avoid in X₀": lambda: {"avoided": [Box([0.8, 0.5], [0.9, 0.6])]},
-    "a box to avoid on the way": lambda: {"avoided": [AVOIDED, Box([0.5, -1.5], [0.7, -1.0])]},
+    "a box to avoid on the way": lambda: {"avoided": [AVOIDED, Box([0.5, -1.5], [0.7, -1.05])]},
     "a box to avoid around the target": lambda: {"avoided": [Box([-0.5, -1.0], [0.5, 1.0])]},
     "a probability that is too large for D": lambda: {"probability": 1 - 1e-15, "risk": 0.5, "rate": 0.05},
     "D that is too small": lambda: {"states": Box([-1.05, -1.2], [1.05, 1.2])},
@@ -195,6 +196,7 @@ FALSE = {
     "ε that is too large": lambda: {"rate": 3.0},
     "a constraint that is violated": lambda: {"problem": task(constraints=StateLimits([0], [0.9], [1.0], [1.0]))},
 }
+REFUSED = ("a box to avoid in X₀", "a box to avoid around the target")  # before anything is proved
 
 
 def worst(V=None, problem=None, gain=1.0, target=TARGET, avoided=(AVOIDED,), states=STATES, **options):
@@ -238,6 +240,10 @@ def sides_of(box):
 def test_nothing_false_is_certified(name):
     options = FALSE[name]()
     assert worst(**options) > 1e-3
+    if name in REFUSED:
+        with pytest.raises(UsageError, match=r"boxes to avoid outside X₀, got one that meets X₀ from \["):
+            prove(boxes=3000, **options)
+        return
     claim = prove(boxes=3000, **options)
     assert claim.verdict in ("falsified", "unknown")
     assert claim.volume_share < 1
@@ -282,6 +288,8 @@ def test_what_cannot_be_claimed_is_refused():
         lyapnet.certify(noiseless(), lyapnet.Reach())
     with pytest.raises(UsageError, match="a target with an interior"):
         prove(target=Box([0.0, -1.0], [0.0, 1.0]))
+    with pytest.raises(UsageError, match="Expected --noise STATE=SIGMA once for each state, got velocity twice"):
+        read_pushes(["velocity=0.1", "velocity=0.2"], option="--noise STATE=SIGMA")
     with pytest.raises(UsageError, match="boxes of 2 states"):
         prove(avoided=[Box([0.0], [1.0])])
     with pytest.raises(UsageError, match="two derivatives in x"):

@@ -418,6 +418,8 @@ class Problem(nn.Module):
             at = torch.cat([x, own.goal.to(x)[None], own.goal + 2 * (x - own.goal)]) if own.has_goal else x
             sigma = own.noise(at)  # outside of X₀ too, where it may be larger
             numbers["σσᵀ"] = sigma @ sigma.mT
+        if own.risk:
+            numbers["risk"] = x.new_tensor([own.risk])
         if own.controls.limits is not None:
             for side, limit in zip(LIMITS, own.controls.limits, strict=True):
                 numbers[side] = limit.to(x).expand(1, m)
@@ -429,7 +431,8 @@ class Problem(nn.Module):
         if not isinstance(record, dict) or not _agree(record.get("x"), own.pop("x")):
             return []
         m = self.system.m
-        unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
+        unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()}
+        unsaid |= {"u*": [[0.0] * m] * 3, "risk": [0.0]}
         if "u*" in record:
             own = {"u*": unsaid["u*"], **own}
         if "σσᵀ" in record or "σσᵀ" in own:
@@ -437,6 +440,8 @@ class Problem(nn.Module):
             unsaid["σσᵀ"], own = none, {"σσᵀ": none, **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}
+        if "risk" in record:
+            own = {"risk": [0.0], **own}
         return [name for name, value in own.items() if not _agree(record.get(name, unsaid.get(name)), value)]
 
 

@@ -157,6 +157,9 @@ def test_a_risk_is_kept_by_copies_and_refused_if_it_is_none():
     problem = task(0.7)
     assert problem.in_steps(steps=3).risk == in_float64(problem).risk == problem.without_noise().risk == 0.7
     assert problem.replaced(risk=0.0).risk == 0
+    assert problem.differences(problem.record()) == task(0.0).differences(task(0.0).record()) == []
+    for one, other in ((task(0.0), problem), (problem, task(0.0)), (task(0.8), problem)):
+        assert one.differences(other.record()) == ["risk"]
     for wrong in (-1.0, math.inf, math.nan):
         with pytest.raises(ValueError, match="finite risk ≥ 0"):
             task(wrong)

@@ -27,6 +27,7 @@ from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 PATHS = 32  # paths of the noise from each state
+TOO_MUCH_SPREAD = "log E exp(θJ)/θ is not measured, as too few of these paths count in it; costs are E J"
 CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
 
@@ -226,7 +227,9 @@ def _evaluation_under_noise(
     lqr, after = None if lqr is None else lqr[:samples], controller.law.beyond
     further = (seed, problem, dearest_corner(controller, noise=seed), None, lqr, None, after)
     about, notes = "", [""] * samples
-    if optimum:
+    if noise.risk and noise.with_risk is None:
+        notes = [TOO_MUCH_SPREAD] * samples
+    elif optimum:
         try:
             first = dataclasses.replace(first, optimal_cost=oracle_of(problem, controller.method)(first.x0))
             about = f"steps of {problem.horizon.dt:g} s ({controller.method}) with u held, in expectation"

@@ -61,7 +61,7 @@ def costs_of_lqr(problem: Problem, x0: State, increments: Increments | None = No
 
 def _lqr(problem: Problem) -> Callable[[int, State], Control] | None:
     try:
-        u, K = regulator(problem)
+        u, K = regulator(problem.replaced(risk=0.0))
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         return None
     exact = in_float64(problem)

@@ -71,20 +71,18 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
     if (noise := result.get("noise")) is None:
         return {}
     levels, optimum = noise["quantiles"], result.get("optimal_cost_mean")
-    relative = (
-        {"… relative to the optimum": f"± {noise['half_width'] / optimum:.2g}"}
-        if optimum and noise["half_width"]
-        else {}
-    )
+    half_width = noise["with_risk_half_width"] if noise.get("risk") else noise["half_width"]
+    relative = {"… relative to the optimum": f"± {half_width / optimum:.2g}"} if optimum and half_width else {}
     return {
         f"E J with its 95 % interval, {noise['paths']} paths from each state": (
             _interval(noise["mean"], noise["half_width"])
         ),
-        **relative,
+        **({} if noise.get("risk") else relative),
         "… from costs alone, without V as a control variate": (
             _interval(noise["plain_mean"], noise["plain_half_width"])
         ),
         **_risk_row(noise),
+        **(relative if noise.get("risk") else {}),
         f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(
             "infinite" if level is None else f"{level:.4g}" for level in levels.values()
         ),
@@ -101,7 +99,8 @@ def _risk_row(noise: dict[str, Any]) -> dict[str, str]:
     """The row of the certainty equivalent in a task with risk."""
     if not noise.get("risk"):  # since version 0.4
         return {}
-    equivalent = _interval(noise["with_risk"], noise["with_risk_half_width"])
+    equivalent = "not measured" if noise["with_risk"] is None else ""
+    equivalent = equivalent or _interval(noise["with_risk"], noise["with_risk_half_width"])
     return {f"log E exp(θJ)/θ, θ = {noise['risk']:g}, with its 95 % interval": equivalent}
 
 
@@ -168,7 +167,7 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
         notes = {f"The optimum is that of {about}": None, **notes}
-    if any((result.get("noise") or {}).get("risk") for result in results):
+    if any((result.get("noise") or {}).get("with_risk") is not None for result in results):
         notes["Costs and the optimum are log E exp(θJ)/θ, of which V is the least"] = None
     if any((result.get("held_cost_ratio") or 1) < 1 for result in results):
         notes["A plant in continuous time may pay less than that optimum: the steps overstate the cost"] = None

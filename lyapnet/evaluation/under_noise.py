@@ -20,6 +20,8 @@ from lyapnet.value.risk import mean_with_risk
 
 CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
+ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in the mean of an exponential
+FAR_FROM_ONE = 0.1  # distance from 1 of a sample's mean whose expectation is 1, at which it says nothing
 DEAREST = 0.05  # share of a state's paths whose mean cost measures its risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
@@ -29,7 +31,8 @@ class NoiseMeasures(NamedTuple):
 
     E J is estimated by the mean of J − M, with M the martingale of V (see lyapnet.loop.rollout.expectations): it has
     the mean of J for any V, and varies less if V is close to the cost to go. For a risk θ see
-    NoisyTrajectory.expected_cost.
+    NoisyTrajectory.exponentials; if θ times the spread of J is large, hardly any path counts in the mean of an
+    exponential, and it is not measured.
     """
 
     paths: int  # from each initial state
@@ -41,7 +44,7 @@ class NoiseMeasures(NamedTuple):
     dearest_mean: float  # mean of J over the dearest 5 % of the paths from a state, averaged over the states
     lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
     risk: float  # θ
-    with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ), from above; None if θ = 0
+    with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ); None if θ = 0 or it cannot be measured
     with_risk_half_width: float | None  # of its 95 % interval
 
 
@@ -52,7 +55,7 @@ def measure_under_noise(
     """(table with one row for each state, measures of the noise, E J under LQR or None if there is no such law).
 
     LQR is rolled out on the same paths; its E J is that of the controller plus the mean difference of both costs. With
-    a risk, the costs of the table and of LQR are certainty equivalents.
+    a risk, the costs of the table and of LQR are certainty equivalents, where these can be measured.
 
     Args:
         counted: number of first states that the measures are about.
@@ -60,7 +63,13 @@ def measure_under_noise(
     problem, horizon = controller.problem, controller.horizon
     assert problem.noise is not None
     controller.compile_for(x0)
-    tables, plain, lqr, means = list[StateTable](), list[Tensor](), list[Tensor](), list[Tensor]()
+    tables, plain, lqr, growths, checks = (
+        list[StateTable](),
+        list[Tensor](),
+        list[Tensor](),
+        list[Tensor](),
+        list[Tensor](),
+    )
     for path in range(paths):
         progress(path, paths)
         noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
@@ -69,12 +78,21 @@ def measure_under_noise(
         tables.append(replace(measure(problem, controller.program, trajectory), cost=expected, left=left))
         plain.append(trajectory.cost.where(expected.isfinite(), torch.inf))
         assert isinstance(trajectory, NoisyTrajectory)
-        means.append(trajectory.mean_cost.where(expected.isfinite(), torch.inf))
+        growth, check = trajectory.exponentials
+        growths.append(growth.where(expected.isfinite(), torch.inf))
+        checks.append(check)
         other = costs_of_lqr(problem, x0, noise)
         lqr += [] if other is None else [other]
     table = average(tables)
-    cost, J = (torch.stack(each)[:, :counted] for each in (means, plain))
-    value, with_risk = table.value[:counted], torch.stack([each.cost for each in tables])[:, :counted]
+    cost, J = torch.stack([each.cost for each in tables])[:, :counted], torch.stack(plain)[:, :counted]
+    value, with_risk, half_width = table.value[:counted], None, None
+    if problem.risk and _enough_paths_count(torch.stack(checks)):
+        growth = torch.stack(growths)
+        factor = 1 + growth.mean(0)
+        if (factor > 0).all():
+            equivalent = table.value + (factor.log() / problem.risk).to(table.value)
+            table, with_risk = replace(table, cost=equivalent), float(equivalent[:counted].mean())
+            half_width = _half_width((growth / (problem.risk * factor))[:, :counted])
     levels = np.quantile(
         J.double().numpy(force=True), QUANTILES, method="inverted_cdf"
     ).tolist()  # of finite costs or not
@@ -83,10 +101,21 @@ def measure_under_noise(
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
         float(_mean_of_dearest(J).mean()),
         float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
-        problem.risk, float(with_risk.mean()) if problem.risk else None,
-        _half_width(with_risk) if problem.risk else None,
+        problem.risk, with_risk, half_width,
     )  # fmt: skip
-    return table, measures, _cost_on_same_paths(table.cost, plain, lqr, problem.risk) if lqr else None
+    risk = 0.0 if with_risk is None else problem.risk
+    return table, measures, _cost_on_same_paths(table.cost, plain, lqr, risk) if lqr else None
+
+
+def _enough_paths_count(exponentials: Tensor) -> bool:
+    """Whether enough of some exponentials (paths, states) of mean one count: ENOUGH_PATHS of the paths, and FEWEST_PATHS.
+
+    What counts is the effective sample size (Σz)²/Σz² of each state, averaged over the states. The mean has to be near one, too, as the sum of those
+    that are drawn is far below one if none of those that count is among them.
+    """
+    size = exponentials.sum(0).square() / exponentials.square().sum(0)
+    mean = float(exponentials.mean())
+    return float(size.mean()) >= max(ENOUGH_PATHS * len(exponentials), FEWEST_PATHS) and abs(mean - 1) < FAR_FROM_ONE
 
 
 def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor], risk: float) -> PerState:

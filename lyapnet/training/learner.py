@@ -22,7 +22,8 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Path, in_float64, path_of, path_under
 from lyapnet.value.policy import LookaheadPolicy
 
-MIN_SAMPLE_SIZE = 0.5  # share of a batch under noise with risk, below which its cost has no derivative
+MIN_SAMPLE_SIZE = 0.5  # share of a batch that has to count in a cost with risk
+MOST_HALVINGS = 64  # of a risk, until so many count
 
 
 class Learner(nn.Module):
@@ -165,23 +166,31 @@ class Learner(nn.Module):
 
     @torch.no_grad()
     def _weights(self, trajectory: Trajectory) -> PerState:
-        """The weights of closed loops in the mean cost with a risk θ: exp(θJ) over its mean for the same x₀.
+        """The weights of closed loops in the mean cost with a risk θ, with a mean of one.
 
-        The derivative of (1/θ) log E exp(θJ) is the mean of that of J with these weights. Under noise they are
-        exp(θ Σ D_n), see Trajectory.compensated, on random plants exp(θ (J − V(0, x₀))); both with a mean of one.
+        The derivative of (1/θ) log E exp(θJ) from x₀ is the mean of that of J with the weights exp(θJ) over its mean.
+        Under noise they are exp(θ Σ D_n), see Trajectory.compensated. On random plants, of which each x₀ has one, they
+        are exp(θ (J − V(0, x₀))), with V of the model: the dearest pairs of state and plant count most.
 
-        Under noise with a strong risk a few of the weights are all that counts, and the derivative is a matter of
-        chance: with an effective sample size (Σw)²/Σw² below MIN_SAMPLE_SIZE of the batch all weights are zero. V then
-        learns from its residuals alone, which hold on every path.
+        With a strong risk a few of the weights are all that counts, and the derivative is a matter of chance. With an
+        effective sample size (Σw)²/Σw² below MIN_SAMPLE_SIZE of the batch all weights are zero under noise: V then
+        learns from its residuals alone, which hold on every path. On random plants θ is halved until it is large
+        enough.
         """
-        if not (isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None):
-            excess = trajectory.cost - trajectory.require_value()[0]
-            weights = torch.ones_like(excess)
-            weights[ON_PLANTS] = len(excess[ON_PLANTS]) * torch.softmax(self.problem.risk * excess[ON_PLANTS], 0)
-            return weights
-        share = torch.softmax(self.problem.risk * trajectory.surprise.sum(0), 0)
-        enough = 1 / share.square().sum() >= MIN_SAMPLE_SIZE * len(share)
-        return len(share) * share * enough
+        risk = self.problem.risk
+        if isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None:
+            share = torch.softmax(risk * trajectory.surprise.sum(0), 0)
+            return len(share) * share * _counts(share)
+        excess = trajectory.cost - trajectory.require_value()[0]
+        weights = torch.ones_like(excess)
+        share = torch.softmax(risk * excess[ON_PLANTS], 0)
+        for _ in range(MOST_HALVINGS):
+            if _counts(share):
+                break
+            risk /= 2
+            share = torch.softmax(risk * excess[ON_PLANTS], 0)
+        weights[ON_PLANTS] = len(share) * share
+        return weights
 
     def _spread_of_optima(self, cost: PerState) -> Tensor | None:
         """The spread of the optima, which makes losses of different steps comparable; None for a task with a goal.
@@ -247,6 +256,11 @@ class Learner(nn.Module):
             },
         }  # fmt: skip
         return {name: value for name, value in scalars.items() if value is not None}
+
+
+def _counts(share: Tensor) -> bool:
+    """Whether weights that sum to one have an effective sample size of at least MIN_SAMPLE_SIZE of their number."""
+    return bool(1 / share.square().sum() >= MIN_SAMPLE_SIZE * len(share))
 
 
 def mean_over_processes(value: Tensor) -> Tensor:

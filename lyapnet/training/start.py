@@ -33,7 +33,7 @@ from lyapnet.value.expansions import (
     path_under,
     sizes,
 )
-from lyapnet.value.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_reason, singular
+from lyapnet.value.linearisation import TO_WRITE, TOO_MUCH_RISK, LinAlgError, Missing, riccati_or_reason, singular
 from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
 from lyapnet.value.risk import mean_with_risk
 
@@ -103,7 +103,7 @@ def choose_start(
             )
             if other is not None:
                 attempt(ANOTHER_WAY, other)
-    if problem.risk and problem.noise is not None and not expansions:
+    if not expansions and any(each.missing == TOO_MUCH_RISK for each in trials.left_out):
         raise UsageError(
             f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
             "no expansion; choose a smaller risk."

@@ -383,11 +383,17 @@ def test_exponentials_of_surprises_have_mean_one_with_risk_and_not_without():
     assert abs(float(each.mean()) - 1) < 4 * float(each.std()) / math.sqrt(len(each)) < 0.02
     other = torch.exp(0.8 * (trajectory.surprise.sum(0) + 0.05))
     assert abs(float(other.mean()) - 1) > 4 * float(each.std()) / math.sqrt(len(each))
-    # V is right, so that each path has the certainty equivalent as its sample, up to the errors of a step
-    found = trajectory.expected_cost
-    assert_close(float(found.mean()), float(trajectory.require_value()[0, 0]), rtol=0.01, atol=0)
-    assert float(found.std()) < 0.7 * float(trajectory.cost.std())
-    assert float(trajectory.mean_cost.mean()) < float(found.mean()) - 0.01
+    # V is right, so that paths differ by the errors of their steps alone
+    growth, moved = trajectory.exponentials
+    V0 = float(trajectory.require_value()[0, 0])
+    assert_close(V0 + math.log1p(float(growth.mean())) / 0.8, V0, rtol=0.01, atol=0)
+    assert float(growth.std()) / 0.8 < 0.7 * float(trajectory.cost.std())
+    assert abs(float(moved.mean()) - 1) < 0.02
+    assert float(trajectory.expected_cost.mean()) < V0 - 0.01
+    # another V, which is wrong by a constant, gives the same number
+    wrong = trajectory._replace(value=trajectory.require_value() + 0.2)
+    again = V0 + 0.2 + math.log1p(float(wrong.exponentials[0].mean())) / 0.8
+    assert_close(again, V0, rtol=0.02, atol=0)
 
 
 def test_with_the_right_value_function_compensated_residuals_vanish_with_risk():

@@ -41,7 +41,7 @@ def check_risk(config: Config, problem: Problem) -> None:
     """Check that a task with risk has something random, and what can be done with it.
 
     Raises:
-        UsageError: there is neither noise nor random plants, too many sources of noise, or the lookahead law.
+        UsageError: there is neither noise nor random plants, too many sources of noise, or a law that knows no risk.
     """
     if not config.risk:
         return
@@ -52,8 +52,10 @@ def check_risk(config: Config, problem: Problem) -> None:
             f"Expected at most {MOST_SOURCES} sources of noise with risk, got {problem.noise.sources}; the mean of an "
             "exponential over more of them is not computed: leave risk out."
         )
-    if config.rollout.policy == "lookahead":
-        raise UsageError("Expected rollout.policy=sampled or hjb with risk, got lookahead; it knows no risk.")
+    if config.rollout.policy not in ("sampled", "hjb"):
+        raise UsageError(
+            f"Expected rollout.policy=sampled or hjb with risk, got {config.rollout.policy}; it knows no risk."
+        )
 
 
 def _require_support(config: Config) -> None:

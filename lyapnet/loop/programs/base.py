@@ -78,7 +78,8 @@ class Program(ABC):
             spread_of_costs: replaces the mean cost in a task without a goal; None for a task with a goal.
             on_model: the trajectories of the model. Of others, on plants that differ, only the cost J counts, since V
                 is the value function of the model.
-            weights: those of the trajectories in the derivative of the mean of J; None: all one.
+            weights: those of the trajectories in the mean of J, with a mean of one; all zero: J has no derivative;
+                None: all one.
 
         Raises:
             ValueError: no V defines the control law.
@@ -88,7 +89,7 @@ class Program(ABC):
         J = trajectory.cost.mean()
         if weights is not None:
             weighted = (weights * trajectory.cost).mean()
-            J = J.detach() + (weighted - weighted.detach())
+            J = weighted if bool((weights > 0).any()) else J.detach()
         per_state = self.per_state(values, trajectory)
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)
@@ -102,7 +103,8 @@ class Program(ABC):
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; for degree one the factor is 1
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
             # log J̄, or J̄ in units of the spread, with J̄ over all processes but the gradient of this batch
-            mean = torch.log(size) if has_goal else mean_over_processes(J.detach()) / size
+            mean = mean_over_processes(J.detach())
+            mean = torch.log(mean) if has_goal else mean / size
             terms["trajectory_cost"] = mean + (J - J.detach()) / size
         else:
             terms["trajectory_cost"] = J

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from lyapnet.base.errors import DivergenceError
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import PerState, State, StatePath, StepPath, Time, Times, ValuePath
@@ -42,19 +43,24 @@ def certainty_equivalent(
     CCᵀ = Δt S⁻¹: exact where V = m, to third order in ΔW elsewhere.
     """
     with torch.no_grad():
-        c, p = V.value_and_state_gradient(t, mean)
+        c, p = (each.double() for each in V.value_and_state_gradient(t, mean))
         H = V.curvature(t)
-        H = p.new_zeros(p.shape[-1], p.shape[-1]) if H is None else H
-    sigma = once_if_constant(noise(x))
-    root = torch.linalg.cholesky(risk_matrix(H, sigma, dt, risk))
+        H = p.new_zeros(p.shape[-1], p.shape[-1]) if H is None else H.double()
+    sigma = once_if_constant(noise(x)).double()  # with a small θ, what is divided by it needs the digits
+    root, failed = torch.linalg.cholesky_ex(risk_matrix(H, sigma, dt, risk))
+    if failed.any():
+        raise DivergenceError(
+            f"Expected a risk with which E exp(risk · V) is finite over each step, got {risk:g}; choose a smaller risk."
+        )
     slope = apply(sigma.mT, p)
     w = risk * dt * torch.cholesky_solve(slope[..., None], root)[..., 0]
     offsets = math.sqrt(noise.sources * dt) * torch.linalg.inv(root).movedim(-2, 0)  # S⁻¹ = root⁻ᵀ root⁻¹
     steps = torch.stack([apply(sigma, w + offset) for each in offsets for offset in (each, -each)])
     model = c + (steps * (p + apply(H, steps) / 2)).sum(-1)
-    excess = risk * (V(t, mean + steps) - model)
+    excess = risk * (V(t, mean + steps.to(mean)).double() - model)
     tilted = c + (w * slope).sum(-1) / 2 - root.diagonal(0, -2, -1).log().sum(-1) / risk
-    return tilted + (torch.logsumexp(excess, 0) - math.log(len(steps))) / risk
+    most = excess.detach().amax(0)
+    return (tilted + (most + torch.log1p(torch.expm1(excess - most).mean(0))) / risk).to(mean)
 
 
 def sampled_value(

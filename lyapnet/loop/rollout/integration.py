@@ -43,7 +43,7 @@ class Trajectory(NamedTuple):
 
     @property
     def expected_cost(self) -> PerState:
-        """A sample of E J_N given x₀, or in a task with risk of its certainty equivalent; without noise J_N itself."""
+        """A sample of E J_N given x₀; without noise J_N itself."""
         return self.cost
 
     def compensated(self) -> "Trajectory":
@@ -85,22 +85,20 @@ class NoisyTrajectory(Trajectory):
         return self.of(super()._replace(**fields), self.martingale, self.variation, self.surprise, self.risk)
 
     @property
-    def mean_cost(self) -> PerState:
+    def expected_cost(self) -> PerState:
         """J_N − M, which has the mean of J_N and varies less."""
         return self.cost - self.martingale
 
     @property
-    def expected_cost(self) -> PerState:
-        """J_N − M, or in a task with risk V₀ + (exp(θ(J_N − V₀)) − exp(θM − ½θ²⟨M⟩))/θ with V₀ = V(0, x₀).
+    def exponentials(self) -> tuple[PerState, PerState]:
+        """(exp(θ(J_N − V₀)) − Z, Z) in float64, with V₀ = V(0, x₀) and Z = exp(θM − ½θ²⟨M⟩), whose mean is one.
 
-        The mean of the latter is V₀ + m/θ, where the certainty equivalent (1/θ) log E exp(θJ) is V₀ + log(1 + m)/θ: an
-        upper bound, equal to first order in m, and without variance where V is right.
+        For the mean g of the first over paths from x₀, (1/θ) log E exp(θJ) = V₀ + log(1 + g)/θ: for any V, and with
+        little variance if V is right.
         """
-        if not self.risk:
-            return self.mean_cost
-        V0, M, variation = (each.double() for each in (self.require_value()[0], self.martingale, self.variation))
-        growth = torch.exp(self.risk * (self.cost - V0)) - torch.exp(self.risk * M - self.risk**2 / 2 * variation)
-        return (V0 + growth / self.risk).to(self.cost)
+        J, V0, M = (each.double() for each in (self.cost, self.require_value()[0], self.martingale))
+        above, moved = self.risk * (J - V0), self.risk * (M - self.risk / 2 * self.variation.double())
+        return torch.expm1(above) - torch.expm1(moved), torch.exp(moved)
 
     def compensated(self) -> Trajectory:
         """The trajectory without the unpredicted part of V, so that programs see expectations over each step.

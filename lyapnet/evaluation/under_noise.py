@@ -20,7 +20,7 @@ from lyapnet.value.risk import mean_with_risk
 
 CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
-ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in the mean of an exponential
+ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in a mean of exponentials
 FAR_FROM_ONE = 0.1  # distance from 1 of a sample's mean whose expectation is 1, at which it says nothing
 DEAREST = 0.05  # share of a state's paths whose mean cost measures its risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
@@ -108,10 +108,10 @@ def measure_under_noise(
 
 
 def _enough_paths_count(exponentials: Tensor) -> bool:
-    """Whether enough of some exponentials (paths, states) of mean one count: ENOUGH_PATHS of the paths, and FEWEST_PATHS.
+    """Whether enough of some exponentials (paths, states) of mean one count: ENOUGH_PATHS of all, and FEWEST_PATHS.
 
-    What counts is the effective sample size (Σz)²/Σz² of each state, averaged over the states. The mean has to be near one, too, as the sum of those
-    that are drawn is far below one if none of those that count is among them.
+    What counts is the effective sample size (Σz)²/Σz² of each state, averaged over the states. The mean of all has to
+    be near one, too: that of those drawn is far below one if none of those that count is among them.
     """
     size = exponentials.sum(0).square() / exponentials.square().sum(0)
     mean = float(exponentials.mean())

@@ -159,8 +159,9 @@ def states_and_controls_to_draw(system: ControlAffineSystem) -> tuple[list[int],
 
 def name_panels_left_out(figure: Figure, system: ControlAffineSystem) -> None:
     """Say above a figure how many states and controls have no panel, if there are some."""
-    if max(system.n - len(system.constants), system.m) > MOST_PANELS:
-        figure.suptitle(f"of {system.n} states and {system.m} controls the first {MOST_PANELS} each", fontsize=9)
+    states = system.n - len(system.constants)
+    if max(states, system.m) > MOST_PANELS:
+        figure.suptitle(f"at most {MOST_PANELS} of {states} states and of {system.m} controls", fontsize=9)
 
 
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:

@@ -141,6 +141,11 @@ class SampledPolicy(ValuePolicy):
         if V.curvature(torch.zeros(()).to(problem.goal)) is None:
             times, n = problem.horizon.times(problem.goal), problem.system.n
             H = riccati(problem).hessian if problem.has_goal else torch.zeros(len(times), n, n)
+            if problem.risk and problem.noise is not None and not H.isfinite().all():
+                raise UsageError(
+                    f"Expected a risk with which E exp(risk · J) is finite at the goal, got {problem.risk:g}; choose a "
+                    "smaller risk."
+                )
             self.riccati = Curve(times, H.to(problem.goal))
 
     def forward(self, t: Time, x: State) -> Control:

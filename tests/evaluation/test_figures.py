@@ -213,7 +213,7 @@ def test_of_many_states_the_first_have_a_panel_and_the_others_are_counted():
     for figure in (figures.trajectories(path, problem), bands(noisy, problem)):
         shown = [axes for axes in figure.axes if axes.get_visible()]
         assert len(shown) == 2 * figures.MOST_PANELS + 1
-        assert figure.get_suptitle() == "of 30 states and 15 controls the first 12 each"
+        assert figure.get_suptitle() == "at most 12 of 30 states and of 15 controls"
     few = problem_of(Linear([[0.0]], [[1.0]]), steps=5)
     path = Rollout(few, HJBPolicy(few, Quadratic(torch.eye(1))), gradient="discrete")(torch.ones(2, 1))
     assert figures.trajectories(path, few).get_suptitle() == ""

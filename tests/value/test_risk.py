@@ -9,7 +9,7 @@ from numpy.polynomial.hermite_e import hermegauss
 from torch import Tensor
 from torch.testing import assert_close
 
-from lyapnet.base.errors import OracleError
+from lyapnet.base.errors import OracleError, UsageError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
@@ -21,7 +21,7 @@ from lyapnet.value.expansions import greedy_law, in_float64, riccati
 from lyapnet.value.linearisation import TOO_MUCH_RISK, riccati_or_reason
 from lyapnet.value.policy import SampledPolicy
 from lyapnet.value.risk import mean_with_risk, risk_gain, with_risk
-from tests.problems import OfExpansion
+from tests.problems import OfExpansion, Quadratic
 
 A, B = np.array([[0.0, 1.0], [0.3, -0.2]]), np.array([[0.0], [1.0]])
 N, DT, SIGMA = 40, 0.05, np.array([0.1, 0.5])
@@ -128,6 +128,9 @@ def test_with_too_large_a_risk_nothing_is_finite_and_the_reason_is_told():
     assert not isinstance(riccati_or_reason(task(3.0)), type(TOO_MUCH_RISK))
     with pytest.raises(OracleError, match="smaller risk"):
         oracle_of(task(40.0))
+    with pytest.raises(UsageError, match="finite at the goal, got 40; choose a smaller risk"):
+        SampledPolicy(task(40.0), Quadratic(torch.eye(2)))
+    assert SampledPolicy(task(3.0), Quadratic(torch.eye(2))).riccati is not None
 
 
 def test_a_sigma_that_depends_on_the_state_has_no_exact_optimum_with_risk():

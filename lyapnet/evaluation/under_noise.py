@@ -78,9 +78,10 @@ def measure_under_noise(
         tables.append(replace(measure(problem, controller.program, trajectory), cost=expected, left=left))
         plain.append(trajectory.cost.where(expected.isfinite(), torch.inf))
         assert isinstance(trajectory, NoisyTrajectory)
-        growth, check = trajectory.exponentials
-        growths.append(growth.where(expected.isfinite(), torch.inf))
-        checks.append(check)
+        if problem.risk:
+            growth, check = trajectory.exponentials
+            growths.append(growth.where(expected.isfinite(), torch.inf))
+            checks.append(check)
         other = costs_of_lqr(problem, x0, noise)
         lqr += [] if other is None else [other]
     table = average(tables)

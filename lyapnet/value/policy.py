@@ -16,7 +16,7 @@ from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.value.derivatives import jacobian
 from lyapnet.value.expansions import held_control, riccati
-from lyapnet.value.risk import risk_gain
+from lyapnet.value.risk import equivalent_derivatives
 
 DESCENTS = 3  # Newton steps of the lookahead law
 STEEP = 5  # the same with constraints, near which V is steep
@@ -152,8 +152,8 @@ class SampledPolicy(ValuePolicy):
         after, free = self._after(t), self.problem.response(x)
         V_x, H = self.V.value_and_state_gradient(after, free.x)[1], self._curvature(after)
         if self.problem.risk and self.problem.noise is not None:
-            G = risk_gain(H, self.problem.noise(x), self.problem.horizon.dt, self.problem.risk)
-            V_x, H = V_x + apply(H, apply(G, V_x)), H + multiply(H, multiply(G, H))
+            sigma, dt = self.problem.noise(x), self.problem.horizon.dt
+            V_x, H = equivalent_derivatives(V_x, H, sigma, dt, self.problem.risk)
         return held_control(self.problem, free, V_x, H)
 
     def _after(self, t: Time) -> Time:

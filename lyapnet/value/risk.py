@@ -17,8 +17,9 @@ import math
 import torch
 from torch import Tensor
 
-from lyapnet.base.linear_algebra import multiply, solve
+from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Noise as NoiseMatrix
+from lyapnet.base.types import State
 
 
 def risk_matrix(H: Tensor, sigma: NoiseMatrix, dt: float, risk: float) -> Tensor:
@@ -29,6 +30,12 @@ def risk_matrix(H: Tensor, sigma: NoiseMatrix, dt: float, risk: float) -> Tensor
 def risk_gain(H: Tensor, sigma: NoiseMatrix, dt: float, risk: float) -> Tensor:
     """G = θΔt σS⁻¹σᵀ, (*batch, n, n)."""
     return risk * dt * multiply(sigma, solve(risk_matrix(H, sigma, dt, risk), sigma.mT))
+
+
+def equivalent_derivatives(p: State, H: Tensor, sigma: NoiseMatrix, dt: float, risk: float) -> tuple[State, Tensor]:
+    """(p̃, H̃), the gradient and the curvature of the certainty equivalent, from p (*batch, n) and H (*batch, n, n)."""
+    G = risk_gain(H, sigma, dt, risk)
+    return p + apply(H, apply(G, p)), H + multiply(H, multiply(G, H))
 
 
 def with_risk(W: Tensor, sigma: NoiseMatrix, dt: float, risk: float) -> Tensor:

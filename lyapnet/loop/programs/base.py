@@ -103,7 +103,7 @@ class Program(ABC):
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; for degree one the factor is 1
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
             # log J̄, or J̄ in units of the spread, with J̄ over all processes but the gradient of this batch
-            mean = mean_over_processes(J.detach())
+            mean = size if has_goal and weights is None else mean_over_processes(J.detach())
             mean = torch.log(mean) if has_goal else mean / size
             terms["trajectory_cost"] = mean + (J - J.detach()) / size
         else:

@@ -16,9 +16,7 @@ FLOOR = 0.01  # ℓ₀ and φ₀ relative to the mean running cost and the mean 
 STATIONARY_FLOOR = 1e-4  # the same for a stationary V, which is exact at the goal by construction
 NEAREST_SHARE = 1 / 300  # smallest factor by which points are moved towards the goal for a stationary V
 CANDIDATES_PER_POINT = 4  # random candidates for each point that is used
-CEILING = (
-    1.2  # points with V above this multiple of the batch's largest V(0, x₀) are outside any funnel of X₀ without noise
-)
+CEILING = 1.2  # points with V above this multiple of the batch's largest V(0, x₀) are outside any noiseless funnel
 
 
 class PointwiseCondition:

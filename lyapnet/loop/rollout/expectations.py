@@ -129,9 +129,8 @@ def martingale(
     dt = float(t[1] - t[0])
 
     def terms(t: Tensor, x: State, increments: Tensor) -> Tensor:
-        V_x = V.value_and_state_gradient(t, x)[1]
-        moved = (V_x * noise.displacement(x, increments)).sum(-1)
-        return torch.stack([moved, dt * apply(noise(x).mT, V_x).square().sum(-1)], -1)
+        slope = apply(noise(x).mT, V.value_and_state_gradient(t, x)[1])
+        return torch.stack([(slope * increments).sum(-1), dt * slope.square().sum(-1)], -1)
 
     both = _in_blocks(terms, t[:-1].reshape(-1, *[1] * (x.ndim - 2)), x[:-1], increments).sum(0)
     return both[..., 0], both[..., 1]

@@ -9,7 +9,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, PerState, State, StatePath, ValuePath
 from lyapnet.task.problem import Problem, Response
-from lyapnet.value.risk import risk_gain
+from lyapnet.value.risk import equivalent_derivatives
 
 
 class Expansion(NamedTuple):
@@ -45,9 +45,8 @@ def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
     if problem.noise is None or not problem.risk:
         return expansion
     x, value, p, H = expansion
-    G = risk_gain(H[1:], problem.noise(x[:-1]), problem.horizon.dt, problem.risk)
-    p_new, H_new = p[1:] + apply(H[1:], apply(G, p[1:])), H[1:] + H[1:] @ G @ H[1:]
-    return Expansion(x, value, torch.cat([p[:1], p_new]), torch.cat([H[:1], H_new]))
+    later = equivalent_derivatives(p[1:], H[1:], problem.noise(x[:-1]), problem.horizon.dt, problem.risk)
+    return Expansion(x, value, *(torch.cat([part[:1], new]) for part, new in zip((p, H), later, strict=True)))
 
 
 def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:

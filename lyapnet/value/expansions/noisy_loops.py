@@ -114,8 +114,11 @@ class _Loops:
         def law(n: int, x: State) -> Control:
             return torch.cat([law(n, part) for law, part in zip(laws, x.chunk(len(laws)), strict=True)])
 
-        k = len(laws)
-        return path_under(self.problem, law, self.x0.repeat(k, 1), self.increments.repeat(1, k, 1))
+        return self._run(law, len(laws))
+
+    def _run(self, law: Callable[[int, State], Control], groups: int) -> Path:
+        """The loops of some groups under a law of all their states."""
+        return path_under(self.problem, law, self.x0.repeat(groups, 1), self.increments.repeat(1, groups, 1))
 
     def costs(self, path: Path) -> Tensor:
         """The mean cost of each group."""
@@ -149,10 +152,7 @@ class _Loops:
                 break
             law = _around(self.problem, path, size, None if law is None else law.member(finite), convex)
             each = law.member(torch.arange(len(going)).repeat_interleave(size))
-            path = path_under(
-                self.problem, greedy_law(self.problem, each), self.x0.repeat(len(going), 1),
-                self.increments.repeat(1, len(going), 1),
-            )  # fmt: skip
+            path = self._run(greedy_law(self.problem, each), len(going))
             cost = self.costs(path)
             gain = least[going] - cost
             better = gain > 0

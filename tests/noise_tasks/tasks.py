@@ -130,6 +130,6 @@ TASKS = {
     "planar_quadrotor": Task(folder("planar_quadrotor")),
     "van_der_pol": Task(folder("van_der_pol"), on_grid([-4, -5], [4, 5], 101, np.linspace(-10, 10, 41))),
     "pendulum": Task(CONF / "pendulum_noise.yaml", on_grid([-1.5, -8], [4.5, 4], 101, np.linspace(-16, 10, 40))),
-    "gap": Task(folder("gap"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),
-    "bridge": Task(folder("bridge"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),
+    "gap": Task(folder("walker", "gap.yaml"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),
+    "bridge": Task(folder("walker", "bridge.yaml"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),
 }

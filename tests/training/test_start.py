@@ -272,8 +272,8 @@ def test_under_strong_noise_training_starts_on_another_way(sigma):
     """Around the wall with a gap, through which the optimum without noise leads."""
     _, start = started({
         "experiment": "gap",
-        "system": {"name": "tests.noise_tasks.gap.system:Walker"},
-        "cost": {"name": "tests.noise_tasks.gap.system:Wall"},
+        "system": {"name": "tests.noise_tasks.walker.system:Walker"},
+        "cost": {"name": "tests.noise_tasks.walker.system:Wall"},
         "initial_states": {"lower": [0, -0.2], "upper": [0, 0.2]},
         "horizon": {"steps": 100, "dt": 0.02},
         "noise": {"aside": sigma},

@@ -1,4 +1,8 @@
-"""A walker at a constant pace, and a pond that he crosses on a narrow bridge or walks around."""
+"""A walker at a constant pace: a wall that he passes through a gap or around its end, or a pond with a narrow bridge.
+
+Source of the wall: Kappen, "Linear theory for control of nonlinear stochastic systems", Physical Review Letters 2005
+(the double slit); "Path integrals and symmetry breaking for optimal control theory", 2005 (the drunken spider).
+"""
 
 import torch
 
@@ -15,6 +19,29 @@ class Walker(lyapnet.ControlAffineSystem):
 
     def g(self, x):
         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
+
+
+class Wall(lyapnet.Cost):
+    """A wall about 1 m ahead, from 0.8 m on one side to far on the other, with a gap of 0.3 m straight ahead.
+
+    Its end and the gap are smooth over some centimetres. At the end of the way the walker is to be straight ahead.
+    """
+
+    R_constant = 0.5 * torch.eye(1)
+
+    def state(self, x):
+        forward, aside = x.unbind(-1)
+
+        def beyond(edge):
+            return torch.sigmoid((aside - edge) / 0.03)
+
+        return 40 * torch.exp(-(((forward - 1) / 0.1) ** 2)) * (beyond(-0.8) - beyond(-0.15) + beyond(0.15))
+
+    def R(self, x):
+        return self.R_constant.expand(*x.shape[:-1], 1, 1)
+
+    def terminal(self, x):
+        return 2 * x[..., 1] ** 2
 
 
 class Pond(lyapnet.Cost):

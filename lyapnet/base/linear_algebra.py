@@ -16,6 +16,7 @@ SMALL = 16  # largest number of scalar products for which elementwise operations
 CONVEX = 0.1  # smallest curvature in u relative to that of the control cost
 LARGE = 1024  # entries from which one matrix for many vectors is not copied for each of them
 UNROLLED = 6  # largest number of unknowns of linear systems that are solved by elementwise operations
+MOST_UNKNOWNS = 32  # largest number of unknowns of the kernel's instruction for linear systems, as in program.cpp
 
 
 def norm(v: Tensor, dim: int = -1) -> Tensor:
@@ -57,7 +58,7 @@ def solve(A: Tensor, B: Tensor) -> Tensor:
     d = A.shape[-1]
     if d == 1:
         return B / A
-    if d > UNROLLED and not are_operators():
+    if d > (MOST_UNKNOWNS if are_operators() else UNROLLED):
         return torch.linalg.solve(A, B)
     if d > 2:
         return multiply(_Inverse.apply(A), B)  # pyright: ignore[reportArgumentType]

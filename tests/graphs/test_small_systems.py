@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.base.linear_algebra import solve
+from lyapnet.base.linear_algebra import MOST_UNKNOWNS, solve
 from lyapnet.base.operators import are_operators, as_operators, operator
 from lyapnet.graphs.compilation import has_compiler
 from lyapnet.graphs.number_kernel.kernel import NumberKernel
@@ -93,6 +93,13 @@ def test_inverses_and_their_slopes_are_torchs(d):
     assert_close(slope, -2 * torch.linalg.solve(A.mT, X) @ X.mT)
 
 
+def test_a_large_system_is_torchs_own():
+    A, B = convex(3, m=MOST_UNKNOWNS + 1)[0] + torch.eye(MOST_UNKNOWNS + 1), torch.randn(3, MOST_UNKNOWNS + 1, 2)
+    graph = trace(lambda A, B: (solve(A, B),), [A, B], whole=True)
+    assert operators_of(graph) == []
+    assert_close(graph(A, B)[0], torch.linalg.solve(A, B))
+
+
 @pytest.mark.parametrize("shapes", [[(4, 4), (5, 4)], [(2, 4, 4), (3, 2, 4)], [(0, 4, 4), (0, 4)]])
 def test_what_is_repeated_lies_once_in_memory(shapes):
     controls, R, b = ControlBox(-0.5, 0.5), convex(m=4)[0].expand(shapes[0]), 4 * torch.randn(shapes[1])
@@ -118,8 +125,8 @@ def test_under_vmap_functions_are_what_they_are_written_as():
 
 
 def test_larger_systems_are_no_instruction():
-    R, b = convex(3, m=33)
-    graph = trace(lambda R, b: (solve(R, b[..., None]),), [R, b], whole=True)
+    controls, (R, b) = ControlBox(-1.0, 1.0), convex(3, m=MOST_UNKNOWNS + 1)
+    graph = trace(lambda R, b: (controls.minimise(R, b),), [R, b], whole=True)
     with pytest.raises(NotImplementedError, match="more than 32 unknowns"):
         NumberKernel(graph, [R, b])
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
-from lyapnet.loop.rollout import Rollout
+from lyapnet.loop.rollout import Rollout, routines
 from lyapnet.loop.rollout.expectations import MOST_SOURCES, certainty_equivalent, expected_value, sampled_value
 from lyapnet.loop.rollout.integration import NoisyTrajectory
 from lyapnet.loop.rollout.runge_kutta import Step
@@ -68,11 +68,13 @@ def loss_of(x: Tensor, running_cost: Tensor, value: Tensor) -> Tensor:
     return 0.3 * (x**2).sum() + running_cost.mean() + (value**2).mean()
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.gate)])
+@pytest.mark.parametrize("form", ["in blocks", "step by step", pytest.param("compiled", marks=pytest.mark.gate)])
 @pytest.mark.parametrize("law", [HJBPolicy, SampledPolicy])
 @pytest.mark.parametrize("method", sample(["euler", "rk4"], 2))
 @pytest.mark.parametrize("constant", [True, False])
-def test_the_gradient_is_that_of_autograd_through_the_same_path(constant, method, law, compiled):
+def test_the_gradient_is_that_of_autograd_through_the_same_path(constant, method, law, form, monkeypatch):
+    if form == "step by step":
+        monkeypatch.setattr(routines, "MOST_STATES_OF_BLOCKS", 1)
     task = problem(constant, method)
     torch.manual_seed(0)
     V = FCN(Scaling([1.0, 1.0], 2.0, 1.0), [16, 16])
@@ -88,7 +90,7 @@ def test_the_gradient_is_that_of_autograd_through_the_same_path(constant, method
     values.append(V(torch.tensor(N * DT), x[-1]))
     leaves = [x0, *V.parameters()]
     expected = torch.autograd.grad(loss_of(torch.stack(x), paid, torch.stack(values)), leaves)
-    if compiled:
+    if form == "compiled":
         assert rollout.discrete is not None
         rollout.discrete.compile(x0.detach())
     trajectory = rollout(x0, increments)

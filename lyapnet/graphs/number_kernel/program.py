@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lyapnet.base.linear_algebra import MOST_UNKNOWNS
 from lyapnet.graphs.operators import OPERATORS
 
 # in the order of INSTRUCTIONS in program.cpp; those of `elementwise_instructions` come after them
@@ -20,7 +21,6 @@ OWN = {  # elementwise instructions that are not in the table of operators: (ope
     "product_and_sum": (3, "x + y * z"),
 }  # fmt: skip
 MOST_RANK = 8  # largest number of axes, as in program.cpp
-MOST_UNKNOWNS = 32  # of a small linear system, as in program.cpp
 LINE = 64  # bytes of a cache line; buffers are aligned to it
 
 

@@ -32,6 +32,7 @@ class Nodes(NamedTuple):
     value: ValuePath  # V at the node
 
 
+MOST_STATES_OF_BLOCKS = 12  # n above which pulling back one step at a time is faster than the Jacobians of a block
 BATCH_AXES = (-2, -1, -2, -1)  # batch axis of each column of Nodes
 
 
@@ -78,6 +79,9 @@ class TracedRoutines:
         Raises:
             UntraceableError: the control flow depends on tensor values, or the code leaves torch.
         """
+        if self.x0.shape[-1] > MOST_STATES_OF_BLOCKS:
+            back = Scan(*self._backwards, len(self.state), sums=self._trained)
+            return Routines(self._scan().loop, StepwiseGradient(back.loop, self.limit))
         return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
 
     def compiled(self) -> Routines:

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from lyapnet.base.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
-from lyapnet.loop.rollout import FIXED_STEP_METHODS, Rollout, backwards, discrete_adjoint
+from lyapnet.loop.rollout import FIXED_STEP_METHODS, Rollout, backwards, discrete_adjoint, routines
 from lyapnet.loop.rollout.runge_kutta import Linearise
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
@@ -94,6 +94,20 @@ def test_gradient_of_every_output_is_that_of_backpropagation(system, cost, polic
     assert error(slopes(discrete, x0), expected) < EXACT
     for name in OUTPUTS:
         assert error(slopes(discrete, x0, partial(weighted, without=name)), expected) > 1e-3
+
+
+@in_trace
+@methods
+@pytest.mark.parametrize("system", ["cartpole"], indirect=True)
+def test_many_states_are_pulled_back_step_by_step(system, cost, policy, x0, method, traced, monkeypatch):
+    """Jacobians of a block have n + m products each; above MOST_STATES_OF_BLOCKS none is computed."""
+    discrete, backprop = routes(system, cost, policy, method)
+    monkeypatch.setattr(routines, "MOST_STATES_OF_BLOCKS", system.n - 1)
+    monkeypatch.setattr(Linearise, "linearise", None)
+    assert error(slopes(discrete, x0), slopes(backprop, x0)) < EXACT
+    monkeypatch.setattr(routines, "MOST_STATES_OF_BLOCKS", system.n)
+    with pytest.raises(pytest.fail.Exception, match="NoneType"):  # the counterpart
+        Rollout(discrete.problem, policy, method, "discrete").discrete._work(x0).traced()
 
 
 WRONG = {  # the linearised loop, with one of its pieces changed

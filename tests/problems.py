@@ -90,7 +90,7 @@ def with_expansion(V: ValueFunction) -> ValueFunction:
         root = torch.randn(V.n, V.n)
         H = wave[..., None] * (root @ root.mT)
         V.start_from_expansion(
-            t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(20, V.n)
+            t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(1, 20, V.n)
         )
     return V
 

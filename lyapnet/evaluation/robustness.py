@@ -1,4 +1,4 @@
-"""The cost of a controller under disturbances: other initial states, another plant, noise, smaller steps."""
+"""The cost of a controller under disturbances: other initial states, another plant, noise, delay, smaller steps."""
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
@@ -79,14 +79,49 @@ class NoisyPolicy(nn.Module):
         return self.policy(t, x + self.deviation * noise)
 
 
+class LatePolicy(nn.Module):
+    """A law with a delay of one sample: on [t_n, t_n + Δt) acts what was computed from x_{n−1}, at first u at rest.
+
+    What is computed from x_n is u(t_n, x_n), or with a prediction u(t_n + Δt, F(x_n, u_n)), where u_n acts meanwhile
+    and F is the model's step: without disturbances that is the best law from t = Δt on.
+
+    Args:
+        policy: u(t, x).
+        model: the problem of the model.
+        predicts: whether the state at which the control will act is predicted.
+    """
+
+    held = True
+
+    def __init__(self, policy: nn.Module, model: Problem, predicts: bool):
+        super().__init__()
+        self.policy, self.model, self.predicts = policy, model, predicts
+        self.computed: Control | None = None  # what acts next
+
+    def forward(self, t: Time, x: State) -> Control:
+        if t.ndim:  # all nodes at once, of a path that is known
+            return self.policy(t, x)
+        u = self.computed
+        if u is None or t == 0:
+            u = self.model.rest.to(x).expand(*x.shape[:-1], -1)
+        horizon = self.model.horizon
+        self.computed = (
+            self.policy((t + horizon.dt).clamp(max=horizon.duration), self.model.step(x, u)[0])
+            if self.predicts
+            else self.policy(t, x)
+        )
+        return u
+
+
 def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Disturbance]:
     """The task itself and its disturbances, each from `samples` initial states:
 
     1. initial states up to 20 % outside X₀, none inside;
     2. each positive physical parameter, except gravity, 20 % lower and higher; policy and cost use the old value;
     3. noise of 1 % on the measured state;
-    4. half the Δt;
-    5. continuous time. A law that is made to be held is held for Δt, with fourth order steps, and so is the optimum.
+    4. a delay of one sample, without and with a prediction by the model, see LatePolicy;
+    5. half the Δt;
+    6. continuous time. A law that is made to be held is held for Δt, with fourth order steps, and so is the optimum.
        Another law is evaluated at every t by an adaptive integrator; its optimum uses half the Δt, or Riccati.
 
     For a family it is the task of one member, see `nominal`. If V accepts the disturbed parameter, there is also the
@@ -114,6 +149,10 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
                 yield undisturbed._replace(name=named, problem=told.problem, policy=policy)
     policy = NoisyPolicy(undisturbed.policy, NOISE * magnitude(controller, x0), stream(seed, TEST))
     yield undisturbed._replace(name=f"noise of {NOISE:.0%} on the state", policy=policy)
+    if controller.method not in ADAPTIVE_METHODS:
+        for predicts, named in ((False, "u one sample late"), (True, "u one sample late, predicted")):
+            late = LatePolicy(undisturbed.policy, problem.without_noise(), predicts)
+            yield undisturbed._replace(name=named, policy=late)
     finer = problem.in_steps(steps=2 * problem.horizon.steps, dt=problem.horizon.dt / 2)
     yield undisturbed._replace(name="half the Δt", problem=finer)
     if controller.closed_loop.policy.held:

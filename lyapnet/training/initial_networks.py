@@ -5,12 +5,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.base.types import State
+from lyapnet.base.random_streams import START, stream
+from lyapnet.base.types import State, StatePath
 from lyapnet.task.cost import is_quadratic_about_target
+from lyapnet.task.problem import Problem
 from lyapnet.training.learner import Learner
 from lyapnet.training.pretraining import typical_cost
 from lyapnet.value.calculus import ValueFunction
-from lyapnet.value.expansions import Expansion, Optimum, sizes, without_penalty
+from lyapnet.value.expansions import (
+    Expansion,
+    Optimum,
+    greedy_law,
+    in_float64,
+    path_under,
+    sizes,
+    without_penalty,
+)
 from lyapnet.value.networks import (
     ExpansionNetwork,
     IgnoringStates,
@@ -43,7 +53,9 @@ def start_from(learner: Learner, expansion: Expansion, x0: State, level: float =
         level: a stationary V uses the regulator's value up to this share of its mean on X₀.
     """
     network, problem, kept = network_of(learner.V), learner.problem, states_of_value(learner)
-    expansion, x0 = _remove_known_penalty(learner, expansion).restricted_to(kept), x0[..., kept].double().cpu()
+    expansion, x0 = _remove_known_penalty(learner, expansion), x0.double().cpu()
+    deviations = _deviations(problem, expansion, x0)[..., kept]
+    expansion, x0 = expansion.restricted_to(kept), x0[..., kept]
     if isinstance(network, StationaryNetwork):
         mean = float(expansion.initially(x0).mean()) or 1.0  # zero if X₀ is the goal alone
         network.start_from_regulator(
@@ -51,12 +63,27 @@ def start_from(learner: Learner, expansion: Expansion, x0: State, level: float =
         )
         return
     curvature = _positive_curvature(network, expansion.hessian)
-    parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
+    parts = (problem.horizon.times(expansion.x), *expansion, curvature, deviations)
     network.start_from_expansion(
         *(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost)
     )
     if network.near_borders is not None:
         network.near_borders.fit(torch.cat([expansion.x, x0]))
+
+
+def _deviations(problem: Problem, expansion: Expansion, x0: State) -> StatePath:
+    """Deviations from an expansion's path: of x₀ (k, n) alone, or under noise of closed loops of its law at all nodes.
+
+    Under noise closed loops may spread farther than X₀, which may even be a single point.
+    """
+    initial = (x0 - expansion.x[0])[None]
+    if problem.noise is None:
+        return initial
+    exact, (steps, dt) = in_float64(problem), (problem.horizon.steps, problem.horizon.dt)
+    increments = problem.noise.draw(steps, dt, x0, stream(0, START, 11))
+    path = path_under(exact, greedy_law(exact, expansion), x0, increments)
+    finite = path.cost.isfinite()
+    return path.x[:, finite] - expansion.x[:, None] if finite.any() else initial
 
 
 def start_from_zero(learner: Learner, optimum: Optimum) -> None:

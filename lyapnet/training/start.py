@@ -3,16 +3,17 @@
 import copy
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from lyapnet.base.errors import UsageError
+from lyapnet.base.errors import DivergenceError, UsageError
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.types import State
 from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
+from lyapnet.loop.programs.terms import costs_to_go
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import MIN_LOOKAHEAD_GAIN, ZERO_VALUE, Candidate, Start
 from lyapnet.training.initial_networks import network_of, start_from, start_from_zero
@@ -91,18 +92,7 @@ def choose_start(
         else:
             attempt(name, expansion)
     if problem.noise is not None:
-        best = expansions[_cheapest(trials.tried).name] if trials.tried else None
-        progress = partial(report, LOOPS_UNDER_NOISE)
-        if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
-            attempt(LOOPS_UNDER_NOISE, expansion)
-        if trials.tried and not problem.risk:  # ways are compared by mean costs
-            known_best, progress = _cheapest(trials.tried), partial(report, ANOTHER_WAY)
-            guesses = waves(in_float64(problem), known_best.cost, GUESSES_UNDER_NOISE)
-            other = expansion_of_another_way(
-                problem, expansions[known_best.name], guesses, stream(0, START, 10), progress
-            )
-            if other is not None:
-                attempt(ANOTHER_WAY, other)
+        _attempt_expansions_under_noise(trials, expansions, attempt)
     if not expansions and any(each.missing == TOO_MUCH_RISK for each in trials.left_out):
         raise UsageError(
             f"Expected a risk with which some law keeps E exp(risk · J) finite, got {problem.risk:g}, with which V has "
@@ -112,6 +102,9 @@ def choose_start(
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])
     if expansions:
+        if problem.noise is not None and not problem.risk:
+            start_from(learners[0], expansions[base.name], x0)
+            expansions[base.name] = trials.with_measured_level(expansions[base.name])
         for learner in learners:
             start_from(learner, expansions[base.name], x0)
     seeks_optima = _optima_may_help(
@@ -135,6 +128,23 @@ def choose_start(
     # under noise nothing is said of continuous time
     held_cost = chosen.cost if problem.noise is not None else float(costs_of_plant(problem, policy, x0).mean())
     return Start(chosen, [*trials.tried, *trials.left_out], held_cost, gain_ahead)
+
+
+def _attempt_expansions_under_noise(
+    trials: "_Trials", expansions: Mapping[str, Expansion], attempt: Callable[[str, Expansion], None]
+) -> None:
+    """Attempt the expansions around loops under noise, those of the cheapest law known and those on another way."""
+    problem = trials.learner.problem
+    best = expansions[_cheapest(trials.tried).name] if trials.tried else None
+    progress = partial(trials.report, LOOPS_UNDER_NOISE)
+    if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
+        attempt(LOOPS_UNDER_NOISE, expansion)
+    if trials.tried and not problem.risk:  # ways are compared by mean costs
+        known_best, progress = _cheapest(trials.tried), partial(trials.report, ANOTHER_WAY)
+        guesses = waves(in_float64(problem), known_best.cost, GUESSES_UNDER_NOISE)
+        other = expansion_of_another_way(problem, expansions[known_best.name], guesses, stream(0, START, 10), progress)
+        if other is not None:
+            attempt(ANOTHER_WAY, other)
 
 
 def _gain_by_looking_ahead(policy: SampledPolicy, x0: State) -> float:
@@ -321,6 +331,23 @@ class _Trials:
         self.tried.insert(0 if name == ZERO_VALUE else len(self.tried), candidate)
         self.known(candidate)
         return candidate
+
+    @torch.no_grad()
+    def with_measured_level(self, expansion: Expansion) -> Expansion:
+        """An expansion with c(t) such that V has the mean of the costs to go, at each node of loops under noise.
+
+        The learner's V is that of the expansion. What noise adds to V in each step is taken from the costs (see
+        Trajectory.compensated), so that nothing changes where V is the cost to go. The law does not depend on c.
+        """
+        assert self.increments is not None
+        if network_of(self.learner.V).at_goal:  # V is zero at the goal, as the cost to go is
+            return expansion
+        try:
+            loops = self.learner.rollout(self.x0, self.increments).compensated()
+        except DivergenceError:
+            return expansion
+        missing = costs_to_go(loops.step_cost, loops.terminal_cost) - loops.require_value()
+        return expansion._replace(value=expansion.value + missing.double().cpu().mean(1))
 
     def leave_out(self, name: str, missing: Missing) -> None:
         """Report a candidate that does not exist, with the reason."""

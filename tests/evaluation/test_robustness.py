@@ -9,12 +9,13 @@ from torch.testing import assert_close
 
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import robustness
-from lyapnet.evaluation.robustness import disturbances
+from lyapnet.evaluation.robustness import LatePolicy, disturbances
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import DoubleIntegrator, Linear
+from lyapnet.value.expansions import riccati
 from lyapnet.value.policy import SampledPolicy
-from tests.problems import Formula, Quadratic, problem_of, untrained
+from tests.problems import Formula, OfExpansion, Quadratic, problem_of, untrained
 
 SMALL = ["network.hidden=[4,4]", "horizon.steps=20"]
 
@@ -54,7 +55,11 @@ def test_each_parameter_changes_the_plant_alone():
     lighter = untrained("cartpole_swingup", *SMALL, "system.parameters.pole_mass=0.8").system
     assert_close(found["pole mass -20%"].problem.system.dynamics(x, u), lighter.dynamics(x, u))
     assert not torch.allclose(found["pole mass -20%"].problem.system.dynamics(x, u), controller.system.dynamics(x, u))
-    assert all(one.policy is controller.closed_loop.policy for name, one in found.items() if "noise" not in name)
+    assert all(
+        one.policy is controller.closed_loop.policy
+        for name, one in found.items()
+        if "noise" not in name and "late" not in name
+    )
     assert controller.system.pole_mass == 1
 
 
@@ -67,6 +72,33 @@ def test_noise_is_on_what_the_policy_reads(controller):
     noisy.policy.forward = lambda t, x: x
     extent = controller.rollout(found["none"].x0).x.abs().amax((0, 1))
     assert_close((noisy(t, x) - x).std(0), 0.01 * extent, rtol=0.05, atol=0)
+
+
+def test_a_late_control_is_that_of_the_state_before(controller):
+    found = by_name(controller, 3)
+    problem, law = controller.problem, controller.policy
+    x = found["none"].x0
+    for name, predicts in (("u one sample late", False), ("u one sample late, predicted", True)):
+        path = Rollout(problem, found[name].policy, controller.method, "backprop")(x)
+        now, u, times = x, torch.zeros(3, 1).double(), problem.horizon.times(x)
+        for n in range(problem.horizon.steps):
+            assert_close(path.x[n], now)
+            following, _ = problem.step(now, u)
+            now, u = following, law(times[n + 1], following) if predicts else law(times[n], now)
+        assert_close(path.x[-1], now)
+
+
+def test_a_prediction_of_the_model_loses_the_first_control_alone():
+    """A double integrator under its optimal law of the steps."""
+    problem = problem_of(DoubleIntegrator(), QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2)), 40, 0.1)
+    V = OfExpansion(problem, riccati(problem))
+    law, x0 = SampledPolicy(problem, V), torch.tensor([[1.0, 0.0], [0.5, -0.5]]).double()
+    late, predicted = (
+        Rollout(problem, LatePolicy(law, problem, predicts), gradient="backprop")(x0).cost for predicts in (False, True)
+    )
+    following, paid = problem.step(x0, torch.zeros(2, 1).double())
+    assert_close(predicted, paid + V(torch.tensor(0.1), following))
+    assert (late > predicted * 1.003).all()
 
 
 def test_rows_are_ratios_to_the_optimum_of_the_disturbed_task(controller):

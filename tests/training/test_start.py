@@ -8,18 +8,20 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet import ControlAffineSystem, load, train
+from lyapnet import ControlAffineSystem, Cost, load, train
 from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.experiment.assembly import Parts
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.experiment.config import config_from_plain
-from lyapnet.training import pretraining
+from lyapnet.loop.programs.terms import costs_to_go
+from lyapnet.task.systems import Linear
+from lyapnet.training import initial_networks, pretraining
 from lyapnet.training.build import build_module
 from lyapnet.training.candidates import ZERO_VALUE
 from lyapnet.training.optimizer import OptimizerOptions
-from lyapnet.training.start import ANOTHER_WAY, choose_start, expansions_of
+from lyapnet.training.start import ANOTHER_WAY, LOOPS_UNDER_NOISE, _Trials, choose_start, expansions_of
 from lyapnet.value.expansions import optimal_trajectories
 from tests.fits import few_optima
 from tests.marks import sample
@@ -280,3 +282,69 @@ def test_under_strong_noise_training_starts_on_another_way(sigma):
     })  # fmt: skip
     assert (start.chosen.name == ANOTHER_WAY) == (sigma == 0.5)
     assert (ANOTHER_WAY in [each.name for each in start.candidates]) == (sigma == 0.5)
+
+
+class Logarithm(Cost):
+    """u² on the way, and 3 log(1 + x²) at the end, which no quadratic function equals."""
+
+    R_constant = torch.eye(1)
+
+    def state(self, x):
+        return torch.zeros_like(x[..., 0])
+
+    def R(self, x):
+        return self.R_constant.expand(*x.shape, 1)
+
+    def terminal(self, x):
+        return 3 * torch.log(1 + x[..., 0] ** 2)
+
+
+class Drift(Linear):
+    """dx = u dt."""
+
+    def __init__(self):
+        super().__init__([[0.0]], [[1.0]])
+
+
+FROM_A_POINT = {
+    "experiment": "mine",
+    "system": {"name": f"{__name__}:Drift"},
+    "cost": {"name": f"{__name__}:Logarithm"},
+    "initial_states": {"lower": 0, "upper": 0},
+    "horizon": {"steps": 20, "dt": 0.05},
+    "noise": {"x1": 1.0},
+}
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_under_noise_V_starts_with_the_mean_of_the_costs_to_go(measured, monkeypatch):
+    if not measured:
+        monkeypatch.setattr(_Trials, "with_measured_level", lambda self, expansion: expansion)
+    (learner,), start = started(FROM_A_POINT | {"noise": {"x1": 4.0}})
+    assert start.chosen.name == LOOPS_UNDER_NOISE
+    path = learner.roll_out(torch.zeros(4096, 1), 5).compensated()
+    missed = costs_to_go(path.step_cost, path.terminal_cost) - path.require_value()
+    assert (missed.mean(1).abs().max() < 0.015 * path.cost.mean()) == measured
+
+
+def test_a_measured_level_changes_nothing_where_V_is_the_cost_to_go(monkeypatch):
+    levels = []
+    measured = _Trials.with_measured_level
+
+    def kept(self, expansion):
+        levels.extend([expansion.value, measured(self, expansion).value])
+        return expansion
+
+    monkeypatch.setattr(_Trials, "with_measured_level", kept)
+    started(LINEAR | {"noise": {"velocity": 0.4}})
+    assert levels[0].max() > 0.9
+    assert_close(levels[1], levels[0], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("spread", [True, False])
+def test_a_network_can_learn_where_noise_leads_from_a_single_point(spread, monkeypatch):
+    if not spread:
+        monkeypatch.setattr(initial_networks, "_deviations", lambda problem, expansion, x0: 0 * x0.double()[None])
+    (learner,), _ = started(FROM_A_POINT)
+    assert (learner.V.scale > 0.1) == spread
+    assert (learner.V.coordinates.abs() < 3) == spread, "one standard deviation of x is about one unit of the network"

@@ -25,8 +25,12 @@ def cost_to_go_error(values: ValuePath, step_cost: StepPath, terminal_cost: PerS
     V_n − J_n = V_N − φ − Σ_{k≥n} violation_k is zero if residual and terminal residual are zero. These are only weakly
     sensitive to the level of V, to which the violations of all steps add up.
     """
-    remaining = torch.cat([step_cost, terminal_cost[None]]).flip(0).cumsum(0).flip(0)
-    return ((values - remaining) ** 2).mean(0)
+    return ((values - costs_to_go(step_cost, terminal_cost)) ** 2).mean(0)
+
+
+def costs_to_go(step_cost: StepPath, terminal_cost: PerState) -> ValuePath:
+    """J_n = Σ_{k≥n} Δt ℓ_k + φ(x_N) at the nodes, (N + 1, *batch)."""
+    return torch.cat([step_cost, terminal_cost[None]]).flip(0).cumsum(0).flip(0)
 
 
 def hinge(values: ValuePath, step_cost: StepPath, margin: float = 0.0) -> PerState:

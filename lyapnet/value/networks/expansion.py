@@ -179,7 +179,8 @@ class ExpansionNetwork(ValueFunction):
         Args:
             exact_end: whether the expansion is φ at the last node, for any x.
             curvature: model of H for control laws, (K, n, n), symmetric positive semidefinite.
-            spread: sample of deviations δ from x̄(0), (k, n); s is their mean ½ δᵀHδ divided by the number of states.
+            spread: samples of deviations δ, (nodes, k, n); s is their mean ½ δᵀHδ, at the node where that is largest,
+                divided by the number of states.
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
         self._fit_curves(t, torch.cat(parts, 1), exact_end)
@@ -189,13 +190,13 @@ class ExpansionNetwork(ValueFunction):
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
         inverse = (vectors * values.reciprocal().where(values > SINGULAR_SHARE * values.max(), 0)) @ vectors.mT
         S = inverse @ hessian[early][:, y][..., p].mean(0) / 2
-        along = apply(vectors.mT, spread[:, y] + spread[:, p] @ S.mT)
-        s = (along**2 * values).sum(-1).mean() / len(y)
+        along = apply(vectors.mT, spread[..., y] + spread[..., p] @ S.mT)
+        s = (along**2 * values).sum(-1).mean(-1).max() / len(y)
         self.at_goal.fill_(float(value.abs().max() <= ROUNDING * s))
         s = s.clamp_min(1e-6 * float(value.abs().max()))  # for X₀ of a single point
         if s > 0:
             self.scale.copy_(s)
-            C, reach = vectors * (values / s).sqrt(), spread[:, p].abs().amax(0)
+            C, reach = vectors * (values / s).sqrt(), spread[..., p].abs().amax((0, 1))
             self.coordinates.zero_()
             for k, i in enumerate(y):
                 self.coordinates[i, y] = C[k]

@@ -381,7 +381,7 @@ def test_a_quadratic_form_starts_near_a_multiple_of_the_scaled_norm():
 def test_around_a_goal_that_costs_nothing_V_and_its_gradient_stay_zero_whatever_the_network_learns(cost_at_goal):
     V, t, x = with_expansion(ExpansionNetwork(SCALING, hidden=(8, 6))), torch.linspace(0, T, 5), torch.zeros(5, 3)
     V.start_from_expansion(
-        t, x, torch.full((5,), cost_at_goal), x, *[torch.eye(3).expand(5, 3, 3)] * 2, torch.randn(20, 3)
+        t, x, torch.full((5,), cost_at_goal), x, *[torch.eye(3).expand(5, 3, 3)] * 2, torch.randn(1, 20, 3)
     )
     value, gradient = (part.detach() for part in V.value_and_state_gradient(t, x))
     stays = (value == cost_at_goal).all() & (gradient == 0).all()

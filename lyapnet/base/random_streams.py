@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST, NOISE, PLANTS = range(10)
+TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST, NOISE, PLANTS, OUTPUTS = range(11)
 
 
 def stream(seed: int, *path: int) -> torch.Generator:

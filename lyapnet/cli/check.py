@@ -104,7 +104,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     parts = parts_of(resolved)
     with default_of(resolved):
         learner = build_learner(resolved, build_problem_to_train(resolved, parts), parts)
-        facts_of(learner, report, known, resolved.rollout.choose_policy)
+        facts_of(learner, report, known, resolved.rollout.choose_policy, resolved.outputs)
 
 
 def print_fact(console: Console, fact: Any) -> None:
@@ -120,8 +120,11 @@ def print_fact(console: Console, fact: Any) -> None:
 
 def _not_reached(facts: list[Any]) -> list[str]:
     """The names of the facts that come after the last one that is known."""
+    from lyapnet.training.config_facts import OBSERVABLE, OUTPUTS
+
     last = max((ORDER.index(fact.name) for fact in facts if fact.name in ORDER), default=-1)
-    return list(ORDER[last + 1 :]) or ["the best start"]
+    observable = [OBSERVABLE] if OUTPUTS in [fact.name for fact in facts] else []
+    return (list(ORDER[last + 1 :]) or ["the best start"]) + observable
 
 
 def _print_json(experiment: str, facts: list[Any], not_reached: list[str]) -> None:

@@ -13,6 +13,7 @@ from lyapnet.cli.options import Debug, Given, of_a_controller
 
 if TYPE_CHECKING:
     from lyapnet.controller.controller import Controller
+    from lyapnet.controller.output_feedback import OutputFeedback
     from lyapnet.evaluation.after_horizon import LoopsAfterHorizon
     from lyapnet.evaluation.measurement import Evaluation
 
@@ -36,6 +37,16 @@ def evaluate(
     paths: Annotated[
         int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
     ] = 32,
+    outputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Also with an estimator: a measured state and its noise; of the system's output(x), only the noise.",
+            metavar="STATE=SIGMA",
+        ),
+    ] = None,
+    estimator: Annotated[
+        str, typer.Option(help="The estimator, where outputs are measured: ekf or ukf, Kalman filters.")
+    ] = "ekf",
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -53,13 +64,14 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = given.load()
+    filtered = _estimator(controller, outputs, estimator)
     count = min(samples, 64)
     if until is not None:
         check_multiple(controller, until, count)
     report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
     report(f"closed loops from {samples:,} states of X₀")
     stage = "optima of states" if controller.problem.noise is None else "paths of the noise"
-    measured = evaluation(controller, samples, seed, optimum, partial(report, stage), paths)
+    measured = evaluation(controller, samples, seed, optimum, partial(report, stage), paths, filtered)
     result = measured.result()
     if not as_json:
         report.rest()
@@ -82,9 +94,26 @@ def evaluate(
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
         report("drawing")
-        wrote = _write_figures(figures, controller, measured, later)
+        wrote = _write_figures(figures, controller, measured, later, filtered)
         report.rest()
         notes.print(wrote, soft_wrap=True)
+
+
+def _estimator(controller: "Controller", outputs: list[str] | None, kind: str) -> "OutputFeedback | None":
+    """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
+    if not outputs:
+        return controller.with_estimator(kind) if controller.measures_outputs else None
+    named = [text.rpartition("=") for text in outputs]
+    try:
+        noise = [float(value) for _, _, value in named]
+    except ValueError as error:
+        raise UsageError(
+            f"Expected --outputs STATE=SIGMA with a number, got {' '.join(outputs)}; as in --outputs angle=0.01."
+        ) from error
+    states = [name for name, _, _ in named if name]
+    if states and len(states) < len(named):
+        raise UsageError(f"Expected --outputs STATE=SIGMA for each, got {' '.join(outputs)}; name the state of each.")
+    return controller.with_estimator(kind, measure=states, noise=noise)
 
 
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:
@@ -101,14 +130,20 @@ def _print_further_tables(result: dict[str, Any], controller: "Controller", coun
 
 
 def _write_figures(
-    folder: Path, controller: "Controller", measured: "Evaluation", later: "list[LoopsAfterHorizon]"
+    folder: Path,
+    controller: "Controller",
+    measured: "Evaluation",
+    later: "list[LoopsAfterHorizon]",
+    estimator: "OutputFeedback | None",
 ) -> str:
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
     from lyapnet.evaluation.after_horizon_figure import distances
+    from lyapnet.evaluation.estimator_figure import states_and_estimates
     from lyapnet.evaluation.noise_figure import bands, states_to_draw
     from lyapnet.evaluation.path_figure import has_plane, paths
     from lyapnet.evaluation.plants_figure import cost_against_parameters
+    from lyapnet.evaluation.with_estimator import loops_with_estimator
 
     x0, problem = measured.table.x0[:12], controller.problem
     seed = None if problem.noise is None else measured.seed
@@ -125,6 +160,9 @@ def _write_figures(
         drawn["optimality"] = figures.optimality(measured.table)
     if measured.plants is not None and measured.plants.optimal_cost is not None:
         drawn["plants"] = cost_against_parameters(measured.plants)
+    if estimator is not None:
+        loops = loops_with_estimator(controller, estimator, measured.table.x0[:1], measured.seed)
+        drawn["estimates"] = states_and_estimates(loops, estimator)
     if any(one.distance is not None for one in later):
         drawn["afterwards"] = distances(later, controller)
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,8 +2,9 @@
 
 import inspect
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -11,10 +12,14 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lyapnet.base.contracts import copied
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
+from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
-from lyapnet.experiment.config import Config, SystemConfig
+from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of
+from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
+from lyapnet.experiment.schema import check_values
 from lyapnet.loop.programs import Program, ValueProgram
 from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.loop.rollout import ClosedLoop, Rollout, Trajectory
@@ -258,6 +263,57 @@ class Controller:
         known = self._after_horizon  # chosen for the family, used for its members
         return Controller(problem, V, rollout, self.program, config, self._beyond, parts, after_horizon=known)
 
+    @property
+    def measures_outputs(self) -> bool:
+        """Whether the config of its run says what is measured of a state."""
+        return self._config is not None and self._config.outputs.noise is not None
+
+    def with_estimator(
+        self,
+        kind: str = "ekf",
+        *,
+        measure: Sequence[str] | None = None,
+        noise: Sequence[float] | float | None = None,
+        process_noise: Mapping[str, float] | None = None,
+        initial_deviation: Sequence[float] | float | None = None,
+    ) -> OutputFeedback:
+        """The controller for states that are not measured: y ↦ u(t, x̂) with a Kalman filter; see OutputFeedback.
+
+        Arguments that are left out are those of `outputs` in the config of the run.
+
+        Args:
+            kind: ekf, the extended Kalman filter; ukf, the unscented one.
+            measure: names of the measured states; empty: the readings of the system's method output(x).
+            noise: standard deviation of each reading, in its unit; one number for all measured states.
+            process_noise: random walk assumed of states, by name, in the unit per √s.
+            initial_deviation: standard deviation of the first estimate of each state.
+
+        Raises:
+            UsageError: there are no outputs, or they do not fit the system.
+        """
+        given = {
+            "measure": None if measure is None else [*measure],
+            "noise": _listed(noise),
+            "process_noise": None if process_noise is None else dict(process_noise),
+            "initial_deviation": _listed(initial_deviation),
+        }
+        known = OutputsConfig() if self._config is None else self._config.outputs
+        section = replace(known, **{key: value for key, value in given.items() if value is not None})
+        check_values(section, "outputs.")
+        plants = self.plants
+        problem = self.problem if plants is None else plants.problem
+        exact = copied(problem)
+        outputs = build_outputs(section, exact)
+        if outputs is None:
+            raise UsageError(
+                "Expected outputs for an estimator, got none; add outputs: {measure: […], noise: […]} to the YAML, or "
+                "give measure and noise."
+            )
+        return OutputFeedback(
+            self.law, problem, outputs, kind, drift_of(section, exact), deviation_of(section, exact),
+            around_state=section.initial_deviation is not None,
+        )  # fmt: skip
+
     def continued(self, beyond: str) -> "Controller":
         """The controller with another law after T: hold, receding, riccati or error, as in lyapnet.load.
 
@@ -426,6 +482,11 @@ def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
             type(V).__name__, 100 * gain,
         )  # fmt: skip
     return HJBPolicy if known is None else known
+
+
+def _listed(given: Sequence[float] | float | None) -> list[float] | None:
+    """A number as a list of one."""
+    return None if given is None else [float(each) for each in np.atleast_1d(np.asarray(given))]
 
 
 def _in_form_of(given: Any, result: Any) -> Any:

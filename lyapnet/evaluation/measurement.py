@@ -14,6 +14,7 @@ from lyapnet.base.sizes import require_memory, size_of_loops
 from lyapnet.base.tables import csv_text
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
+from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.evaluation.after_horizon import share_at_goal
 from lyapnet.evaluation.on_plants import OnPlants, measure_on_plants
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
@@ -21,6 +22,7 @@ from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 from lyapnet.evaluation.under_noise import NoiseMeasures, measure_under_noise
+from lyapnet.evaluation.with_estimator import EstimatorMeasures, loops_with_estimator, measure_with_estimator
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.value.after_horizon import LOOPS
@@ -56,6 +58,7 @@ class Evaluation(NamedTuple):
     optimum_of: str = ""  # model of the optimum: its steps, or continuous time; empty if none was computed
     noise: NoiseMeasures | None = None  # with noise; costs are then expectations
     plants: OnPlants | None = None  # with random plants; all other measures are those on the model
+    estimated: EstimatorMeasures | None = None  # with outputs; all other measures are those with the state known
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -81,6 +84,7 @@ class Evaluation(NamedTuple):
             **counts,
             **({} if self.noise is None else {"noise": plain(self.noise._asdict())}),
             **({} if self.plants is None else {"plants": plain(self.plants.summary())}),
+            **({} if self.estimated is None else {"outputs": plain(self.estimated._asdict())}),
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
@@ -147,6 +151,7 @@ def evaluate(
     optimum: bool = True,
     progress: Report = silent,
     paths: int = PATHS,
+    estimator: OutputFeedback | None = None,
 ) -> dict[str, Any]:
     """The summary of a controller on new states of X₀; see Evaluation.result.
 
@@ -154,7 +159,7 @@ def evaluate(
         ValueError: fewer than one sample, or than two paths.
         DivergenceError: a closed loop is not finite.
     """
-    return evaluation(controller, samples, seed, optimum, progress, paths).result()
+    return evaluation(controller, samples, seed, optimum, progress, paths, estimator).result()
 
 
 def evaluation(
@@ -164,6 +169,7 @@ def evaluation(
     optimum: bool = True,
     progress: Report = silent,
     paths: int = PATHS,
+    estimator: OutputFeedback | None = None,
 ) -> Evaluation:
     """The measures of a controller on new states of X₀; with noise, expectations over paths from each of them.
 
@@ -172,6 +178,8 @@ def evaluation(
         optimum: whether costs are compared with the optimum, if there is an oracle.
         progress: progress callback of the oracle.
         paths: paths of the noise from each state, if the task has noise.
+        estimator: the controller with an estimator, which is measured besides; None: an extended Kalman filter if the
+            config has outputs.
 
     Raises:
         ValueError: fewer than one sample.
@@ -182,11 +190,18 @@ def evaluation(
     size = size_of_loops(samples, controller.horizon.steps, controller.system.n)
     require_memory("samples", samples, size, "draw fewer")
     x0 = controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST))
+    if estimator is None and controller.measures_outputs:
+        estimator = controller.with_estimator()
+    estimated = None
+    if estimator is not None:
+        estimated = measure_with_estimator(loops_with_estimator(controller, estimator, x0[:samples], seed), estimator)
     if controller.problem.noise is not None:
-        return _evaluation_under_noise(controller, x0, samples, seed, optimum, progress, paths)
+        under_noise = _evaluation_under_noise(controller, x0, samples, seed, optimum, progress, paths)
+        return under_noise._replace(estimated=estimated)
     plants = controller.plants
     on_plants = None if plants is None else measure_on_plants(plants, x0[:samples], seed, optimum, progress)
-    return _evaluation_on_model(controller, x0, samples, seed, optimum, progress)._replace(plants=on_plants)
+    on_model = _evaluation_on_model(controller, x0, samples, seed, optimum, progress)
+    return on_model._replace(plants=on_plants, estimated=estimated)
 
 
 def _evaluation_on_model(

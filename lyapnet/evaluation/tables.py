@@ -47,7 +47,7 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
         table.add_row(label, _entry(key, result[key]))
-    for label, entry in {**_noise_rows(result), **_plant_rows(result)}.items():
+    for label, entry in {**_noise_rows(result), **_plant_rows(result), **_estimator_rows(result)}.items():
         table.add_row(label, entry)
     for name, error in result.get("terminal_errors", {}).items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
@@ -119,6 +119,36 @@ def _plant_rows(result: dict[str, Any]) -> dict[str, str]:
             f"not finite on {1 - share:.1%}" if share < 1 else f"{found['cost_mean']:.4g}"
         ),
         **(ratios if found["optimal_cost_mean"] is not None else {}),
+    }
+
+
+def _estimator_rows(result: dict[str, Any]) -> dict[str, str]:
+    """The rows of a controller that reads outputs."""
+    if (found := result.get("outputs")) is None:
+        return {}
+    read = ", ".join(f"{name} ± {noise:.3g}" for name, noise in found["readings"].items())
+    (low, high), nees = found["nees_band"], (found["nees"], found["nees_half_width"])
+    ratio, half_width = found["cost_ratio"], found["half_width"]
+    known, cost = (
+        "not finite" if each is None else f"{each:.5g}" for each in (found["known_cost_mean"], found["cost_mean"])
+    )
+    return {
+        f"with {found['estimator']} from {read}": f"{found['runs']} runs",
+        "… cost J, mean: state known, estimated": f"{known}, {cost}",
+        "… their ratio, with its 95 % interval": "–"
+        if ratio is None or half_width is None
+        else f"{ratio:.4f} ± {half_width:.2g}",
+        "… runs lost, which cost half more than with the state known": f"{found['lost_fraction']:.2%}",
+        "… (x − x̂)ᵀP⁻¹(x − x̂)/n, mean: 1 if P is right": "not finite"
+        if None in nees
+        else f"{nees[0]:.3f} ± {nees[1]:.2g}",
+        f"… steps where its mean over runs is in the 95 % band, {low:.3f} to {high:.3f}": f"{found['nees_inside']:.0%}",
+        **{
+            f"… error of {name} at T, root mean square; √P": "not finite"
+            if None in error
+            else f"{error[0]:.3g}; {error[1]:.3g}"
+            for name, error in found["errors"].items()
+        },
     }
 
 

@@ -163,6 +163,23 @@ class HorizonConfig:
 
 
 @dataclass
+class OutputsConfig:
+    """What is measured of a state, and what an estimator assumes; V and the law are about the state itself."""
+
+    measure: list[str] = setting([], "Names of the measured states; none: the readings of the system's output(x).")
+    noise: list[float] | None = setting(
+        None, "Standard deviation of each reading, in its unit; null: the state is known.", above=0
+    )
+    process_noise: dict[str, float] = setting(
+        {}, "Random walk that an estimator assumes, each as STATE: σ in its unit per √s; see the page on outputs.",
+        at_least=0,
+    )  # fmt: skip
+    initial_deviation: list[float] | None = setting(
+        None, "Standard deviation of the first estimate of each state; null: that of a uniform x₀ in X₀.", above=0
+    )
+
+
+@dataclass
 class NetworkConfig:
     """V(t, x). Fields with null use the network's default."""
 
@@ -298,6 +315,7 @@ class Config:
         {}, "Ranges [least, greatest] of parameters of the plant that V and the law are not told; see the page on "
         "plants that differ.",
     )  # fmt: skip
+    outputs: OutputsConfig = field(default_factory=OutputsConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -97,6 +97,16 @@ class FamilySystem(ControlAffineSystem):
         sigma = member.noise(x)
         return torch.cat([sigma, sigma.new_zeros(*sigma.shape[:-2], p.shape[-1], sigma.shape[-1])], -2)
 
+    @property
+    def has_output(self) -> bool:
+        return self.system.has_output
+
+    def output(self, x: State) -> Tensor:
+        """h(x; p) of each member."""
+        x, p = self.split(x)
+        member: Any = self.member(p)
+        return member.output(x)
+
     def inverse_mass(self, x: State) -> ControlMatrix:
         """BᵀM(q; p)⁻¹B of each member, if the system has a mass matrix."""
         x, p = self.split(x)

@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lyapnet.experiment.config import Config
+from lyapnet.experiment.config import Config, OutputsConfig
+
+OUTPUTS, OBSERVABLE = "outputs", "observable"  # facts of a task with outputs: what is measured, what that tells
 
 
 class Fact(NamedTuple):
@@ -15,14 +17,26 @@ class Fact(NamedTuple):
 
 
 def facts_of_config(config: Config) -> list[Fact]:
-    """The horizon and X₀ as the config gives them."""
+    """The horizon, X₀ and the outputs as the config gives them."""
     horizon, box = config.horizon, config.initial_states
     steps = f"{horizon.steps} step{'s' * (horizon.steps > 1)}"
     end = ", and on: without end" if horizon.stationary else ""
     return [
         Fact("horizon", f"T = {horizon.steps * horizon.dt:g} s in {steps} of {horizon.dt:g} s{end}"),
         Fact("X₀", f"between {format_numbers(box.lower)} and {format_numbers(box.upper)}"),
+        *_outputs_facts(config.outputs),
     ]
+
+
+def _outputs_facts(outputs: OutputsConfig) -> list[Fact]:
+    """What is measured, if that is not the state."""
+    if outputs.noise is None:
+        return []
+    noise = outputs.noise * len(outputs.measure) if len(outputs.noise) == 1 else outputs.noise
+    if not outputs.measure:
+        return [Fact(OUTPUTS, f"output(x) of the system ± {format_numbers(outputs.noise)}")]
+    read = (f"{name} ± {each:.3g}" for name, each in zip(outputs.measure, noise, strict=False))
+    return [Fact(OUTPUTS, ", ".join(read))]
 
 
 def format_numbers(numbers: Sequence[float]) -> str:

@@ -8,8 +8,13 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.contracts import SLOPE, jumps
+from lyapnet.base.random_streams import OUTPUTS as OUTPUTS_STREAM
 from lyapnet.base.random_streams import START, stream
 from lyapnet.experiment.assembly.classes import float64_defaults
+from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of
+from lyapnet.experiment.config import OutputsConfig
+from lyapnet.loop.estimation.kalman import ExtendedKalmanFilter
+from lyapnet.loop.estimation.observability import observability
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.task.domain import as_written
@@ -18,7 +23,7 @@ from lyapnet.task.noise import Noise
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
-from lyapnet.training.config_facts import Fact, format_numbers
+from lyapnet.training.config_facts import OBSERVABLE, Fact, format_numbers
 from lyapnet.training.learner import Learner
 from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.stage_messages import StageReport, silent
@@ -39,6 +44,8 @@ from lyapnet.value.linearisation import (
 STABLE_GAIN = 2.0  # largest gain Δt λ of the HJB law for which Euler steps do not oscillate and grow
 REACHABILITY_TOLERANCE = 1e-10  # relative to A in scaled units: larger entries count as coupling of two states
 EIGENVALUE_TOLERANCE = 1e-8  # relative to the largest eigenvalue or A: smaller real and imaginary parts count as zero
+OBSERVED_LOOPS = 16  # closed loops along which it is tested whether outputs tell the state
+VAGUE = 0.5  # share of the uncertainty of x₀ that is left at T, above which the outputs do not tell a state
 DOMAIN_TEST_STATES = 64  # states of X₀ whose closed loops are checked against the domain
 ROUNDING_UNITS = 100  # rounding error of a rate that sums several terms, in units of the machine precision
 
@@ -48,6 +55,7 @@ def facts_of(
     report: StageReport = silent,
     known: Callable[[Fact], None] = lambda fact: None,
     may_look_ahead: bool = False,
+    outputs: OutputsConfig | None = None,
 ) -> list[Fact]:
     """The facts about a learner's problem. Also initialises V and the constraint penalty as training would.
 
@@ -55,6 +63,7 @@ def facts_of(
         report: called with each stage of the work.
         known: called with each fact as soon as it is known.
         may_look_ahead: whether training may replace the sampled law by the lookahead law.
+        outputs: what is measured of the state; None: the state itself.
     """
     problem, facts = learner.problem, list[Fact]()
 
@@ -92,8 +101,37 @@ def facts_of(
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))
         return facts
-    tell(*_start_facts(start), *_domain_facts(learner))
+    tell(*_start_facts(start), *_domain_facts(learner), *observability_facts(learner, outputs))
     return facts
+
+
+def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[Fact]:
+    """Whether the outputs of a config tell the state along closed loops of the start; none without outputs."""
+    problem = in_float64(learner.problem)
+    if config is None or (outputs := build_outputs(config, problem)) is None:
+        return []
+    x0 = problem.initial_states.sample(OBSERVED_LOOPS, stream(0, START, OUTPUTS_STREAM))
+    law, like = learner.rollout.closed_loop.policy, learner.problem.initial_states.lower
+    times = problem.horizon.times(like)
+    path = path_under(problem, lambda n, x: law(times[n], x.to(like)).to(x), x0)
+    rows = path.cost.isfinite()
+    if not rows.any():
+        return [Fact(OBSERVABLE, "unknown: no closed loop of the start is finite")]
+    x, u = path.x[:, rows], path.u[:, rows]
+    deviation, system = deviation_of(config, problem), problem.system
+    found = observability(ExtendedKalmanFilter(problem, outputs, drift_of(config, problem)), x, u, deviation)
+    fixed = problem.initial_states.widths == 0  # their deviation is no more than a convention
+    usual = torch.where(fixed, deviation.maximum(x.flatten(0, 1).std(0)), deviation)
+    vague = [name for name, lost in zip(system.state_names, found.of_first > VAGUE * usual, strict=True) if lost]
+    told = ", ".join(
+        f"{name} {left:.2g}" for name, left in zip(system.state_names, found.deviation.tolist(), strict=True)
+    )
+    condition = f"condition {found.condition:.2g}" if found.rank == system.n else f"rank {found.rank} of {system.n}"
+    known = f"standard deviations at T: {told}; {condition} of the Gramian along {x.shape[1]} loops of the start"
+    if not vague:
+        return [Fact(OBSERVABLE, f"yes; {known}")]
+    listed = ", ".join(vague)
+    return [Fact(OBSERVABLE, f"no: the outputs hardly tell {listed}; {known}", f"measure {listed}, or what they move")]
 
 
 def _domain_facts(learner: Learner) -> Iterator[Fact]:

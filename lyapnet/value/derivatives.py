@@ -32,26 +32,27 @@ class StepDerivatives:
             z = z.detach().requires_grad_()
             F, paid = self._at(z)
             (l_z,) = torch.autograd.grad(paid.sum(), z, materialize_grads=True)
-            F_z = _rows(lambda z: self._at(z)[0], z, self.n)
-            l_zz = _rows(lambda z: _slope(self._at(z)[1], z), z, z.shape[-1])
+            F_z = jacobian_of(lambda z: self._at(z)[0], z, self.n)
+            l_zz = jacobian_of(lambda z: _slope(self._at(z)[1], z), z, z.shape[-1])
         return [F.detach(), paid.detach(), F_z, l_z, l_zz]
 
     def curvature(self, z: Tensor, p: State) -> Tensor:
         """The second derivatives of pᵀF at z (r, n + m), for p (r, n)."""
         with torch.enable_grad():
-            return _rows(lambda z: _slope((p * self._at(z)[0]).sum(-1), z), z, z.shape[-1])
+            return jacobian_of(lambda z: _slope((p * self._at(z)[0]).sum(-1), z), z, z.shape[-1])
 
     def _at(self, z: Tensor) -> tuple[State, PerState]:
         return self.step(z[..., : self.n], z[..., self.n :])
 
 
-def _rows(function: Callable[[Tensor], Tensor], z: Tensor, outputs: int) -> Tensor:
-    """∂y/∂z (r, outputs, inputs) of y = function(z), row i of copy i of z."""
+@torch.enable_grad()
+def jacobian_of(function: Callable[[Tensor], Tensor], z: Tensor, outputs: int) -> Tensor:
+    """∂y/∂z (*batch, outputs, inputs) of y = function(z) at z (*batch, inputs); row i is that of copy i of z."""
     copies = z.detach().expand(outputs, *z.shape).clone().requires_grad_()
     y = function(copies)
     if not y.requires_grad:
-        return z.new_zeros(len(z), outputs, z.shape[-1])
-    rows = torch.eye(outputs).to(y)[:, None].expand_as(y)
+        return z.new_zeros(*z.shape[:-1], outputs, z.shape[-1])
+    rows = torch.eye(outputs).to(y).reshape(outputs, *[1] * (y.ndim - 2), outputs).expand_as(y)
     return torch.autograd.grad(y, copies, rows, materialize_grads=True)[0].movedim(0, -2)
 
 

@@ -22,7 +22,8 @@ class ControlAffineSystem(nn.Module, ABC):
     A subclass implements f and g with torch operations on tensors of any leading shape, and declares its coordinates.
     Physical parameters are constructor arguments, stored as Python floats or buffers. A subclass may have a method
     `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction. It may also have a method `noise(x)`,
-    σ(x) of shape (*batch, n, k) in state units per √s, if it is driven by noise: dx = (f + gu)dt + σ(x)dW.
+    σ(x) of shape (*batch, n, k) in state units per √s, if it is driven by noise: dx = (f + gu)dt + σ(x)dW. A method
+    `output(x)`, h(x) of shape (*batch, p), says what is measured of a state, if that is not the state itself.
     """
 
     state_names: Sequence[str] = ()
@@ -76,6 +77,11 @@ class ControlAffineSystem(nn.Module, ABC):
                 "def noise(self, x), or give the attribute another name if there is no noise."
             )
         return method
+
+    @property
+    def has_output(self) -> bool:
+        """Whether the system declares what is measured by a method `output(x)`."""
+        return callable(getattr(type(self), "output", None))
 
     @property
     def n(self) -> int:

@@ -1,0 +1,165 @@
+"""A controller that reads noisy outputs instead of the state: an estimator, and the law at its estimate."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lyapnet.base.contracts import copied
+from lyapnet.base.errors import UsageError
+from lyapnet.base.types import State
+from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
+from lyapnet.task.outputs import Outputs
+from lyapnet.task.problem import Problem
+from lyapnet.value.law_after_horizon import ContinuedPolicy
+
+
+class OutputFeedback:
+    """y_k ↦ u(t_k, x̂_k), called once in each Δt: x̂_k is the estimate from all readings up to y_k.
+
+    The first call is at t = 0: its readings correct the first estimate before the first control. Each further call
+    predicts one step under the control of the call before, and corrects by its readings. States are estimated one by
+    one, in a batch of any shape, which is that of the first readings; computations are in float64.
+
+    Args:
+        law: u(t, x) with its V, for all t ≥ 0.
+        problem: the steps that the estimator predicts with. Its states are those of the law, or (x, p) with parameters
+            p that are estimated too.
+        outputs: h and the noise of the readings.
+        kind: ekf, the extended Kalman filter; or ukf, the unscented one.
+        drift: see KalmanFilter.
+        deviation: standard deviation of the first estimate, (n,).
+        around_state: whether evaluations draw the first estimate around x₀ by this deviation, or take the centre of X₀.
+
+    Raises:
+        UsageError: unknown kind.
+    """
+
+    problem: Problem
+    filter: KalmanFilter
+
+    def __init__(
+        self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
+        deviation: Deviations, around_state: bool = False,
+    ):  # fmt: skip
+        if kind not in FILTERS:
+            raise UsageError(f"Expected an estimator as one of {', '.join(FILTERS)}, got {kind!r}; choose one of them.")
+        self.law, self.kind, self.outputs = law, kind, outputs
+        self.deviation, self.around_state = deviation, around_state
+        self._state_of_law = problem.initial_states.lower[: law.system.n]  # its precision, device and length
+        self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
+        self.filter = FILTERS[kind](self.problem, outputs, drift)
+        self.reset()
+
+    def reset(self, x_hat: Any = None, P: Any = None, t: float = 0.0) -> None:
+        """Begin again: the next call of `step` is at t.
+
+        Args:
+            x_hat: the first estimate (*batch, n); None: the centre of X₀.
+            P: its covariance (*batch, n, n); None: diagonal, with `outputs.initial_deviation` or that of a uniform
+                distribution on X₀.
+
+        Raises:
+            ValueError: a shape does not fit, or P is not symmetric positive semidefinite.
+        """
+        n = self.problem.system.n
+        first = self.problem.initial_states.center if x_hat is None else _float64(x_hat)
+        covariance = torch.diag(self.deviation.square()) if P is None else _float64(P)
+        if first.ndim < 1 or first.shape[-1] != n:
+            names = ", ".join(self.problem.system.state_names)
+            raise ValueError(
+                f"Expected x_hat of shape (*batch, {n}), got {tuple(first.shape)}; the last axis holds {names}."
+            )
+        if covariance.shape[-2:] != (n, n) or not _is_covariance(covariance):
+            raise ValueError(
+                f"Expected P of shape (*batch, {n}, {n}), symmetric and positive semidefinite, got another matrix of "
+                f"shape {tuple(covariance.shape)}; give a covariance."
+            )
+        self._belief, self._u, self._t = Belief(first, covariance), None, float(t)
+        self._like: Any = x_hat if x_hat is not None else np.empty(0)
+
+    def draw_first(self, x0: State, generator: torch.Generator) -> State | None:
+        """A first estimate of each x₀, normal around it; None if none was given, and the centre of X₀ stands for it."""
+        if not self.around_state:
+            return None
+        return x0 + self.deviation * torch.randn(x0.shape, generator=generator, dtype=torch.float64)
+
+    @property
+    def belief(self) -> Belief:
+        """x̂ and P in float64, after the last readings."""
+        return self._belief
+
+    @property
+    def t(self) -> float:
+        """Time of the last readings, in s; before the first ones that of `reset`."""
+        return self._t
+
+    @property
+    def x_hat(self) -> Any:
+        """x̂ (*batch, n) after the last readings."""
+        return _in_form_of(self._like, self._belief.x)
+
+    @property
+    def P(self) -> Any:
+        """The covariance of x̂ (*batch, n, n) after the last readings."""
+        return _in_form_of(self._like, self._belief.P)
+
+    @torch.no_grad()
+    def step(self, y: Any, applied: Any = None) -> Any:
+        """u(t, x̂) (*batch, m) after readings y (*batch, p), within the limits of the controls.
+
+        Args:
+            y: the readings; NaN for one that is missing.
+            applied: the control that the plant received since the last call, if it was not the one returned.
+
+        Raises:
+            ValueError: the shapes do not fit, or a reading is infinite.
+        """
+        self.observe(y, applied)
+        like = self._state_of_law
+        u = self.law(like.new_tensor(self._t), self._belief.x[..., : len(like)].to(like)).detach()
+        self._u = u.double().cpu()
+        return _in_form_of(y, u)
+
+    @torch.no_grad()
+    def observe(self, y: Any, applied: Any = None) -> None:
+        """The estimate after readings y, without a control; see `step`."""
+        readings, p = _float64(y), self.outputs.count
+        batch = tuple(self._belief.x.shape[:-1])
+        if readings.ndim < 1 or readings.shape[-1] != p or (self._u is not None and readings.shape[:-1] != batch):
+            expected = f"(*batch, {p})" if self._u is None else str((*batch, p))
+            raise ValueError(
+                f"Expected y of shape {expected}, got {tuple(readings.shape)}; the last axis holds "
+                f"{', '.join(self.outputs.names)}."
+            )
+        if bool(readings.isinf().any()):
+            raise ValueError("Expected finite readings, got an infinite one; write NaN for one that is missing.")
+        self._like = y
+        if self._u is None:
+            x, P = self._belief
+            n = x.shape[-1]
+            batch = torch.broadcast_shapes(x.shape[:-1], P.shape[:-2], readings.shape[:-1])
+            if batch != readings.shape[:-1]:
+                raise ValueError(
+                    f"Expected readings for each of {tuple(batch)} estimates, got {tuple(readings.shape)}."
+                )
+            belief = Belief(x.expand(*batch, n), P.expand(*batch, n, n))
+        else:
+            u = self._u if applied is None else _float64(applied).expand(self._u.shape)
+            belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
+        self._belief = self.filter.update(belief, readings)
+
+
+def _float64(given: Any) -> Tensor:
+    return torch.as_tensor(given, dtype=torch.float64, device="cpu").detach()
+
+
+def _is_covariance(P: Tensor) -> bool:
+    size = P.abs().amax((-1, -2), keepdim=True)
+    symmetric = bool(((P - P.mT).abs() <= 1e-9 * size).all())
+    return symmetric and bool((torch.linalg.eigvalsh(P) >= -1e-9 * size[..., 0]).all())
+
+
+def _in_form_of(given: Any, result: Tensor) -> Any:
+    return result if isinstance(given, Tensor) else result.numpy(force=True)

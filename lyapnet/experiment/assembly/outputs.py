@@ -1,0 +1,87 @@
+"""Builds the outputs of a config."""
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly.classes import section
+from lyapnet.experiment.assembly.entries import index_of, repeated, require_length
+from lyapnet.experiment.config import OutputsConfig
+from lyapnet.loop.estimation.kalman import initial_deviation, least_drift
+from lyapnet.task.outputs import MeasuredStates, Outputs, SystemOutput
+from lyapnet.task.problem import TRIED, Problem
+
+ASSUMED = "outputs.process_noise"
+
+
+def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
+    """The outputs of a config for a problem in float64; None if it has none.
+
+    Raises:
+        UsageError: a name, a length or a number does not fit, or h breaks its contract.
+    """
+    if config.noise is None:
+        if config.measure or config.process_noise or config.initial_deviation is not None:
+            raise UsageError(
+                "Expected outputs.noise, the standard deviation of each reading, got none; give one for each."
+            )
+        return None
+    system, name = problem.system, type(problem.system).__name__
+    with section("outputs"):
+        if config.measure:
+            states = [index_of(each, "outputs.measure", system) for each in config.measure]
+            if repeated_names := [each for k, each in enumerate(config.measure) if each in config.measure[:k]]:
+                raise UsageError(f"Expected outputs.measure with each state once, got {repeated_names[0]} twice.")
+            noise = repeated(config.noise, len(states))
+            require_length("outputs.noise", len(noise), config.measure)
+            return MeasuredStates(system, states, noise)
+        if not system.has_output:
+            raise UsageError(
+                f"Expected outputs.measure, or a method output(x) of {name}, got neither; name the states that are "
+                f"measured, of {', '.join(system.state_names)}."
+            )
+        x = problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0))
+        return SystemOutput(system, config.noise, x)
+
+
+def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
+    """The random walk (n,) that an estimator assumes of each state besides the noise of the problem.
+
+    Where neither a walk is given nor the problem has noise, it is `least_drift`.
+
+    Raises:
+        UsageError: a name is no state.
+    """
+    if not config.process_noise:
+        least = least_drift(problem)
+        return least if problem.noise is None else torch.zeros_like(least)
+    drift = torch.zeros_like(problem.initial_states.lower)
+    for name, strength in config.process_noise.items():
+        drift[index_of(name, ASSUMED, problem.system)] = strength
+    return drift
+
+
+def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
+    """The standard deviation (n,) of the first estimate of each state; of parameters that of their range.
+
+    Raises:
+        UsageError: the length does not fit.
+    """
+    deviation, system = initial_deviation(problem.initial_states), problem.system
+    if config.initial_deviation is not None:
+        moving = [name for i, name in enumerate(system.state_names) if i not in system.constants]
+        given = repeated(config.initial_deviation, len(moving))
+        require_length("outputs.initial_deviation", len(given), moving)
+        deviation[: len(moving)] = deviation.new_tensor(given)
+    return deviation
+
+
+def check_outputs(config: OutputsConfig, problem: Problem) -> None:
+    """Check the section before a training, which knows nothing of outputs.
+
+    Raises:
+        UsageError: as the functions above.
+    """
+    if build_outputs(config, problem) is not None:
+        drift_of(config, problem)
+        deviation_of(config, problem)

@@ -1,0 +1,53 @@
+"""Whether readings tell the state: the observability Gramian and the filter's covariance along closed loops."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.base.types import ControlPath, StatePath
+from lyapnet.loop.estimation.kalman import Deviations, ExtendedKalmanFilter
+
+SEEN = 1e-6  # displacement of all readings by a direction of x₀, in their noise, from which it counts as seen
+
+
+class Observability(NamedTuple):
+    """What readings tell, in the system linearised along some closed loops.
+
+    W = Σ_k Φ_kᵀH_kᵀR⁻¹H_kΦ_k is the observability Gramian, with x₀ in units of its standard deviation before any
+    reading: the readings of the horizon tell a direction of x₀ better than that where its eigenvalue exceeds 1. For
+    control it matters what is known of the present state, and a direction that decays needs no reading: hence the
+    uncertainty at T.
+    """
+
+    rank: int  # least rank of W over the loops
+    condition: float  # largest ratio of the extreme eigenvalues of W; infinite if the rank is below n
+    deviation: Deviations  # √P of each state after the last reading, root mean square over the loops
+    of_first: Deviations  # the same without process noise: what is left of the uncertainty of x₀
+
+
+def observability(
+    kalman: ExtendedKalmanFilter, x: StatePath, u: ControlPath, deviation: Float[Tensor, " n"]
+) -> Observability:
+    """The observability along closed loops x (N + 1, b, n), u (N, b, m).
+
+    Args:
+        deviation: standard deviation of each component of x₀ before any reading.
+    """
+    A = kalman.step_jacobian(x[:-1], u)
+    H, Q = kalman.output_jacobian(x), kalman.process_noise(x[:-1])
+    first = torch.diag(deviation)
+    P, with_noise = first.expand(2, x.shape[1], -1, -1).square(), Q.new_tensor([1.0, 0.0])[:, None, None, None]
+    phi, seen = first.expand_as(P[0]), list[Tensor]()
+    for k in range(len(x)):
+        if k:
+            phi, P = A[k - 1] @ phi, A[k - 1] @ P @ A[k - 1].mT + with_noise * Q[k - 1]
+        seen.append(H[k] @ phi / kalman.outputs.noise[:, None])
+        P = kalman.corrected(P, H[k])[0]
+    roots = torch.linalg.svdvals(torch.cat(seen, -2))  # of W, (b, n)
+    rounding = torch.finfo(roots.dtype).eps * roots.shape[-1] * roots[:, :1]
+    rank = (roots > rounding.clamp_min(SEEN)).sum(-1)
+    condition = (roots[:, 0] / roots[:, -1].where(rank == x.shape[-1], 0.0)).square()
+    left = P.diagonal(dim1=-2, dim2=-1).mean(1).sqrt()
+    return Observability(int(rank.min()), float(condition.max()), left[0], left[1])

@@ -47,6 +47,14 @@ def evaluate(
     estimator: Annotated[
         str, typer.Option(help="The estimator, where outputs are measured: ekf or ukf, Kalman filters.")
     ] = "ekf",
+    deviation: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--initial-deviation",
+            help="Standard deviation of its first estimate: one for all states, or again for each.",
+            metavar="SIGMA",
+        ),
+    ] = None,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -64,7 +72,7 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = given.load()
-    filtered = _estimator(controller, outputs, estimator)
+    filtered = _estimator(controller, outputs or [], estimator, deviation)
     count = min(samples, 64)
     if until is not None:
         check_multiple(controller, until, count)
@@ -99,10 +107,13 @@ def evaluate(
         notes.print(wrote, soft_wrap=True)
 
 
-def _estimator(controller: "Controller", outputs: list[str] | None, kind: str) -> "OutputFeedback | None":
+def _estimator(
+    controller: "Controller", outputs: list[str], kind: str, deviation: list[float] | None
+) -> "OutputFeedback | None":
     """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
     if not outputs:
-        return controller.with_estimator(kind) if controller.measures_outputs else None
+        known = controller.measures_outputs
+        return controller.with_estimator(kind, initial_deviation=deviation or None) if known else None
     named = [text.rpartition("=") for text in outputs]
     try:
         noise = [float(value) for _, _, value in named]
@@ -113,7 +124,7 @@ def _estimator(controller: "Controller", outputs: list[str] | None, kind: str) -
     states = [name for name, _, _ in named if name]
     if states and len(states) < len(named):
         raise UsageError(f"Expected --outputs STATE=SIGMA for each, got {' '.join(outputs)}; name the state of each.")
-    return controller.with_estimator(kind, measure=states, noise=noise)
+    return controller.with_estimator(kind, measure=states, noise=noise, initial_deviation=deviation or None)
 
 
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:

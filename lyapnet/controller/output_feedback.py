@@ -137,18 +137,22 @@ class OutputFeedback:
             raise ValueError("Expected finite readings, got an infinite one; write NaN for one that is missing.")
         self._like = y
         if self._u is None:
-            x, P = self._belief
-            n = x.shape[-1]
-            batch = torch.broadcast_shapes(x.shape[:-1], P.shape[:-2], readings.shape[:-1])
-            if batch != readings.shape[:-1]:
-                raise ValueError(
-                    f"Expected readings for each of {tuple(batch)} estimates, got {tuple(readings.shape)}."
-                )
-            belief = Belief(x.expand(*batch, n), P.expand(*batch, n, n))
+            belief = self._first_of(tuple(readings.shape[:-1]))
         else:
             u = self._u if applied is None else _float64(applied).expand(self._u.shape)
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
         self._belief = self.filter.update(belief, readings)
+
+    def _first_of(self, batch: tuple[int, ...]) -> Belief:
+        """The first estimate of each loop of a batch."""
+        x, P = self._belief
+        try:
+            return Belief(x.expand(*batch, -1), P.expand(*batch, -1, -1))
+        except RuntimeError as error:
+            raise ValueError(
+                f"Expected readings of as many loops as x_hat and P of the reset, {tuple(x.shape[:-1])} and "
+                f"{tuple(P.shape[:-2])}, got {batch}; reset first."
+            ) from error
 
 
 def _float64(given: Any) -> Tensor:

@@ -54,6 +54,47 @@ def found_of(config, problem=None, **options):
     return facts_of(build_learner(config, problem or build_problem(config)), **options)
 
 
+def observed(A, outputs, **changes):
+    """The fact of a linear system with a control on each state."""
+    config = config_from_plain(linear(A, torch.eye(len(A)).tolist(), outputs=outputs, **changes))
+    found = {fact.name: fact for fact in found_of(config, outputs=config.outputs)}
+    return found.get("observable")
+
+
+@pytest.mark.usefixtures("without_start")
+def test_states_that_outputs_do_not_tell_are_named():
+    """A velocity tells no position, and a position tells both; what nobody sees and decays is not missed."""
+    mass = [[0, 1], [0, 0]]
+    told = observed(mass, {"measure": ["x1"], "noise": 0.01})
+    assert told.found.startswith("yes; standard deviations at T: x1 0.0")
+    not_told = observed(mass, {"measure": ["x2"], "noise": 0.01})
+    assert not_told.found.startswith("no: the outputs hardly tell x1; ")
+    assert "rank 1 of 2" in not_told.found
+    assert not_told.advice.startswith("measure x1")
+    decaying = observed([[-5, 0], [0, 0]], {"measure": ["x2"], "noise": 0.01})
+    assert decaying.found.startswith("yes")
+    assert "rank 1 of 2" in decaying.found
+    growing = observed([[1, 0], [0, 0]], {"measure": ["x2"], "noise": 0.01})
+    assert growing.found.startswith("no: the outputs hardly tell x1; ")
+    assert observed(mass, {}) is None
+
+
+def test_check_names_what_outputs_do_not_tell(tmp_path, capsys):
+    (tmp_path / "task.yaml").write_text(yaml.safe_dump(TASK))
+    command = ["check", str(tmp_path / "task.yaml"), "--json", "outputs.measure=[angle]"]
+    assert main([*command, "outputs.noise=0.01"]) == 0
+    facts = {fact["fact"]: fact["found"] for fact in json.loads(capsys.readouterr().out)["facts"]}
+    assert facts["outputs"] == "angle ± 0.01"
+    assert facts["observable"].startswith("yes")
+    for override, message in (
+        ("outputs.noise=[0.1,0.2]", "Expected outputs.noise with one entry (angle), got 2"),
+        ("outputs.noise=-1", "Expected outputs.noise > 0"),
+        ("outputs.noise=null", "Expected outputs.noise, the standard deviation of each reading, got none"),
+    ):
+        assert main([*command, override]) != 0
+        assert message in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("without_start")
 def test_modes_and_controllability():
     reached = facts(linear([[0, 1], [4, 0]], [[0], [1]]))

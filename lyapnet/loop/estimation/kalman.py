@@ -66,7 +66,7 @@ class KalmanFilter(nn.Module, ABC):
     def update(self, belief: Belief, y: Readings) -> Belief:
         """The belief after readings y."""
 
-    def _next(self, x: State, u: Control) -> State:
+    def _next(self, x: Tensor, u: Control) -> Tensor:
         """F(x, u), for states with more axes in front than controls."""
         return self.problem.step(x, u.expand(*x.shape[:-1], -1))[0]
 

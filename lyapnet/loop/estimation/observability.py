@@ -44,7 +44,7 @@ def observability(
         if k:
             phi, P = A[k - 1] @ phi, A[k - 1] @ P @ A[k - 1].mT + with_noise * Q[k - 1]
         seen.append(H[k] @ phi / kalman.outputs.noise[:, None])
-        P = kalman.corrected(P, H[k])[0]
+        P = kalman.corrected(P, H[k].expand(2, -1, -1, -1))[0]
     roots = torch.linalg.svdvals(torch.cat(seen, -2))  # of W, (b, n)
     rounding = torch.finfo(roots.dtype).eps * roots.shape[-1] * roots[:, :1]
     rank = (roots > rounding.clamp_min(SEEN)).sum(-1)

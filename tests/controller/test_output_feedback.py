@@ -1,0 +1,171 @@
+"""A controller that reads outputs: one loop is as many at once, limits hold, families and random plants; and refusals."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+import lyapnet
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly import Parts, build_problem
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.systems import Pendulum
+from lyapnet.value.expansions import riccati
+from tests.problems import OfExpansion
+
+TASK = {
+    "experiment": "outputs",
+    "system": {"name": "pendulum"},
+    "cost": {"Q": [1, 0.1], "R": 0.1, "Q_T": [2, 1]},
+    "initial_states": {"lower": -1, "upper": 1},
+    "controls": {"lower": -0.5, "upper": 0.5},
+    "horizon": {"steps": 20, "dt": 0.05},
+    "outputs": {"measure": ["angle"], "noise": 0.01},
+}
+
+
+def controller_of(**changes):
+    """One with the V of the Riccati solution."""
+    config = config_from_plain({**TASK, **changes})
+    problem = build_problem(config)
+    return lyapnet.Controller(problem, OfExpansion(problem, riccati(problem)), config=config)
+
+
+class Seen(Pendulum):
+    """A pendulum of which a camera sees sine and cosine of the angle."""
+
+    def output(self, x):
+        return torch.stack([torch.sin(x[..., 0]), torch.cos(x[..., 0])], -1)
+
+
+@pytest.mark.parametrize("kind", ["ekf", "ukf"])
+def test_one_loop_by_numpy_is_one_of_a_batch(kind):
+    controller = controller_of()
+    y = 0.3 * torch.randn(6, 4, 1, generator=torch.Generator().manual_seed(1))
+    batch = controller.with_estimator(kind)
+    u = torch.stack([batch.step(each) for each in y])
+    for i in range(4):
+        one = controller.with_estimator(kind)
+        alone = np.stack([one.step(each.numpy()) for each in y[:, i]])
+        assert isinstance(one.x_hat, np.ndarray)
+        assert_close(torch.from_numpy(alone), u[:, i])
+        assert_close(torch.from_numpy(one.P), batch.P[i])
+        assert one.t == batch.t == pytest.approx(5 * 0.05)
+    assert u.abs().max() == 0.5  # the limits hold
+    assert not torch.equal(u[:, 0], u[:, 1])
+
+
+def test_the_first_control_knows_the_first_reading():
+    """It is the law at the estimate; without its reading it would be the law at the centre of X₀."""
+    controller = controller_of()
+    feedback = controller.with_estimator(noise=1e-6)
+    assert_close(feedback.x_hat, np.zeros(2))
+    u = feedback.step([0.7])
+    assert feedback.t == 0
+    assert_close(feedback.x_hat, np.array([0.7, 0.0]), rtol=1e-5, atol=1e-5)
+    assert_close(u, controller.policy(0.0, feedback.x_hat))
+    assert not np.allclose(u, controller.policy(0.0, np.zeros(2)))
+
+
+def test_each_call_predicts_by_a_step_under_the_control_that_was_applied():
+    controller, missing = controller_of(), [math.nan]
+    for given in (None, [0.2]):
+        feedback = controller.with_estimator()
+        u, before = feedback.step([0.7]), feedback.x_hat
+        feedback.step(missing, applied=given)
+        applied = torch.as_tensor(u if given is None else given)
+        expected = controller.problem.step(torch.from_numpy(before), applied)[0]
+        assert_close(torch.from_numpy(feedback.x_hat), expected)
+
+
+def test_reset_begins_with_an_estimate_at_a_time():
+    feedback = controller_of().with_estimator()
+    feedback.step([0.7])
+    P = np.diag([1e-12, 0.04])
+    feedback.reset([0.5, 0.1], P, t=0.4)
+    assert_close(feedback.P, P)
+    feedback.step([0.7])
+    assert feedback.t == 0.4
+    assert_close(feedback.x_hat, np.array([0.5, 0.1]), rtol=0, atol=1e-6)
+    feedback.reset()
+    assert_close(feedback.x_hat, np.zeros(2))
+
+
+def test_a_controller_that_was_trained_without_outputs_gets_them():
+    controller = controller_of(outputs={})
+    with pytest.raises(UsageError, match="Expected outputs for an estimator, got none"):
+        controller.with_estimator()
+    feedback = controller.with_estimator("ukf", measure=["velocity"], noise=[0.1], initial_deviation=0.2)
+    assert feedback.step(torch.zeros(3, 1)).shape == (3, 1)
+    assert_close(controller_of().with_estimator(noise=0.5).outputs.noise, torch.tensor([0.5]))
+
+
+def test_the_output_of_a_system_of_ones_own_is_read():
+    config = config_from_plain({**TASK, "outputs": {"noise": [0.01, 0.02]}})
+    parts = Parts(system=Seen())
+    problem = build_problem(config, parts)
+    controller = lyapnet.Controller(problem, OfExpansion(problem, riccati(problem)), config=config, parts=parts)
+    feedback = controller.with_estimator()
+    for _ in range(5):
+        feedback.step([math.sin(0.5), math.cos(0.5)])
+    assert feedback.P[0, 0] < 0.01**2
+    assert [*feedback.outputs.names] == ["reading 1", "reading 2"]
+
+
+def test_a_family_is_told_its_estimated_parameters():
+    controller = controller_of(family={"length": [0.5, 1.5]})
+    feedback = controller.with_estimator()
+    u = feedback.step([0.7])
+    assert feedback.x_hat.shape == (3,)
+    assert_close(u, controller.policy(0.0, feedback.x_hat[:2], length=feedback.x_hat[2]))
+
+
+def test_parameters_of_random_plants_are_estimated_and_the_law_is_not_told():
+    """From readings of a pendulum twice as long its length is found; the law still is that of the model."""
+    controller = controller_of(randomise={"length": [0.5, 2.5]}, controls={})
+    plants, feedback = controller.plants, controller.with_estimator()
+    assert plants is not None
+    z = torch.tensor([0.5, 0.0, 2.0])
+    for _ in range(60):
+        u = feedback.step(z[:1])
+        assert_close(u, controller.policy(feedback.t, torch.as_tensor(feedback.x_hat)[..., :2]), rtol=1e-9, atol=1e-9)
+        z = plants.problem.step(z, u)[0].detach()
+    assert abs(float(feedback.x_hat[2]) - 2.0) < 0.2 < abs(1.5 - 2.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.with_estimator("kf"), "Expected an estimator as one of ekf, ukf, got 'kf'"),
+        (lambda c: c.with_estimator(measure=["speed"]), "Expected outputs.measure among angle, velocity, got 'speed'"),
+        (lambda c: c.with_estimator(measure=["angle", "angle"]), "with each state once, got angle twice"),
+        (lambda c: c.with_estimator(noise=[0.1, 0.1]), "Expected outputs.noise with one entry"),
+        (lambda c: c.with_estimator(noise=-0.1), "Expected outputs.noise > 0"),
+        (lambda c: c.with_estimator(noise=0), "Expected outputs.noise > 0"),
+        (lambda c: c.with_estimator(measure=[]), "Expected outputs.measure, or a method output"),
+        (lambda c: c.with_estimator(process_noise={"angle": -1}), "Expected outputs.process_noise.angle ≥ 0"),
+        (lambda c: c.with_estimator(process_noise={"speed": 1}), "Expected outputs.process_noise among angle, velocity"),
+        (lambda c: c.with_estimator(initial_deviation=[1, 2, 3]), "Expected outputs.initial_deviation with 2 entries"),
+        (lambda c: c.with_estimator().step([0.1, 0.2]), r"Expected y of shape \(\*batch, 1\), got \(2,\)"),
+        (lambda c: c.with_estimator().step([math.inf]), "Expected finite readings"),
+        (lambda c: c.with_estimator().reset([0.0]), r"Expected x_hat of shape \(\*batch, 2\), got \(1,\)"),
+        (lambda c: c.with_estimator().reset(P=[[1, 2], [0, 1]]), "symmetric and positive semidefinite"),
+        (lambda c: c.with_estimator().reset(P=[[1, 0], [0, -1]]), "symmetric and positive semidefinite"),
+    ],
+)  # fmt: skip
+def test_bad_input_gets_one_line(call, message):
+    with pytest.raises((UsageError, ValueError), match=message) as error:
+        call(controller_of())
+    assert "\n" not in str(error.value)
+
+
+def test_a_batch_keeps_its_size():
+    feedback = controller_of().with_estimator()
+    feedback.step(np.zeros((3, 1)))
+    with pytest.raises(ValueError, match=r"Expected y of shape \(3, 1\), got \(4, 1\)"):
+        feedback.step(np.zeros((4, 1)))
+    feedback.reset(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="Expected readings of as many loops"):
+        feedback.step(np.zeros((3, 1)))

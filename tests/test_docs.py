@@ -122,7 +122,15 @@ KNOWN = dict(keys_of(Config))
 def is_key(name: str) -> bool:
     """Whether the config has a key or a section of that name; what a section leaves open, it has."""
     parts = ("system", "cost", "controls", "program")
-    open_ended = ("trainer", "family", "noise", "randomise", "target", *(f"{part}.parameters" for part in parts))
+    open_ended = (
+        "trainer",
+        "family",
+        "noise",
+        "outputs.process_noise",
+        "randomise",
+        "target",
+        *(f"{part}.parameters" for part in parts),
+    )
     return name in {*KNOWN, *SECTIONS} or name.rpartition(".")[0] in open_ended
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,13 @@ from lyapnet.cli import main
 from lyapnet.evaluation.estimator_figure import states_and_estimates
 from lyapnet.evaluation.tables import evaluation_table
 from lyapnet.evaluation.with_estimator import loops_with_estimator, measure_with_estimator
+from lyapnet.experiment.assembly import Parts, build_problem
+from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.noise import StateNoise
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.expansions import riccati
 from tests.controller.test_output_feedback import TASK, controller_of
+from tests.pages import ROOT, blocks
 from tests.problems import OfExpansion, problem_of
 
 STEPS, DT, SIGMA, STRENGTHS = 15, 0.1, 0.2, (0.1, 0.4)
@@ -161,3 +165,21 @@ def test_the_command_measures_outputs_of_any_checkpoint(tmp_path, capsys):
         assert main([*command, *given]) != 0
         assert message in capsys.readouterr().err
     assert math.isfinite(found["cost_mean"])
+
+
+def test_the_tanks_of_the_page_are_a_task_whose_levels_one_reading_tells():
+    page = ROOT / "docs" / "outputs.md"
+    (source,) = [block for block in blocks("python", page) if "class Tanks" in block]
+    (written,) = [block for block in blocks("yaml", page) if "tanks:Tanks" in block]
+    names: dict[str, Any] = {}
+    exec(source, names)
+    config = config_from_plain({"experiment": "tanks", **yaml.safe_load(written)})
+    parts = Parts(system=names["Tanks"]())
+    problem = build_problem(config, parts)
+    controller = lyapnet.Controller(problem, OfExpansion(problem, riccati(problem)), config=config, parts=parts)
+    estimator = controller.with_estimator("ukf")
+    loops = loops_with_estimator(controller, estimator, controller.initial_states.sample(64))
+    found = measure_with_estimator(loops, estimator)
+    assert found.cost_ratio is not None
+    assert found.cost_ratio < 1.1
+    assert found.errors["upper level (m)"][0] < 1e-3

@@ -96,8 +96,9 @@ def test_unscented_means_are_exact_to_third_order():
     outputs = SystemOutput(problem.system, [0.1, 1e-9], torch.rand(4, 2))
     belief = Belief(torch.tensor([0.4, 0.0]), torch.diag(torch.tensor([s**2, 1e-6])))
     expected = math.exp(-(s**2) / 2) * math.cos(0.4)  # in closed form
-    surprises = [float(kind(problem, outputs, torch.zeros(2)).update(
-        belief, torch.tensor([torch.nan, expected])).x[0] - 0.4) for kind in (UnscentedKalmanFilter, ExtendedKalmanFilter)]  # fmt: skip
+    y, none = torch.tensor([torch.nan, expected]), torch.zeros(2)
+    kinds = (UnscentedKalmanFilter, ExtendedKalmanFilter)
+    surprises = [float(kind(problem, outputs, none).update(belief, y).x[0]) - 0.4 for kind in kinds]
     assert abs(surprises[0]) < 1e-6 < abs(surprises[1])
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Reach, Region, Sampled, Statistical, Tube
     from lyapnet.controller.controller import ArrayTrajectory, Controller
     from lyapnet.controller.loading import load
+    from lyapnet.controller.output_feedback import OutputFeedback
     from lyapnet.evaluation.measurement import evaluate
     from lyapnet.exchange.export import export
     from lyapnet.loop.programs import LyapunovProgram, Program, Tolerances, ValueProgram
@@ -59,6 +60,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "base.interpolation": ["Table"],
     "base.linear_algebra": ["norm"],
     "controller.loading": ["load"],
+    "controller.output_feedback": ["OutputFeedback"],
     "value.policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
     "task.horizon": ["Horizon"],
     "task.problem": ["Problem"],
@@ -99,6 +101,7 @@ __all__ = [
     "NoisyFunnel",
     "ObstacleCost",
     "OptimizerOptions",
+    "OutputFeedback",
     "PeriodicCost",
     "Problem",
     "Program",

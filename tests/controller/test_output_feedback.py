@@ -1,4 +1,4 @@
-"""A controller that reads outputs: one loop is as many at once, limits hold, families and random plants; and refusals."""
+"""A controller that reads outputs: one loop is one of a batch, limits hold, families, random plants; and refusals."""
 
 import math
 
@@ -146,7 +146,7 @@ def test_parameters_of_random_plants_are_estimated_and_the_law_is_not_told():
         (lambda c: c.with_estimator(noise=0), "Expected outputs.noise > 0"),
         (lambda c: c.with_estimator(measure=[]), "Expected outputs.measure, or a method output"),
         (lambda c: c.with_estimator(process_noise={"angle": -1}), "Expected outputs.process_noise.angle ≥ 0"),
-        (lambda c: c.with_estimator(process_noise={"speed": 1}), "Expected outputs.process_noise among angle, velocity"),
+        (lambda c: c.with_estimator(process_noise={"speed": 1}), "Expected outputs.process_noise among angle"),
         (lambda c: c.with_estimator(initial_deviation=[1, 2, 3]), "Expected outputs.initial_deviation with 2 entries"),
         (lambda c: c.with_estimator().step([0.1, 0.2]), r"Expected y of shape \(\*batch, 1\), got \(2,\)"),
         (lambda c: c.with_estimator().step([math.inf]), "Expected finite readings"),

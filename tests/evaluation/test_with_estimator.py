@@ -1,4 +1,4 @@
-"""What evaluations say of an estimator, against LQG in closed form; consistent where its noise is right, and not else."""
+"""What evaluations say of an estimator, against LQG in closed form; consistent where its noise is right, not else."""
 
 import json
 import math

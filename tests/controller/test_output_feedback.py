@@ -30,7 +30,8 @@ def controller_of(**changes):
     """One with the V of the Riccati solution."""
     config = config_from_plain({**TASK, **changes})
     problem = build_problem(config)
-    return lyapnet.Controller(problem, OfExpansion(problem, riccati(problem)), config=config)
+    V = OfExpansion(problem, riccati(problem)).to(problem.initial_states.lower.dtype)
+    return lyapnet.Controller(problem, V, config=config)
 
 
 class Seen(Pendulum):
@@ -169,3 +170,13 @@ def test_a_batch_keeps_its_size():
     feedback.reset(np.zeros((2, 2)))
     with pytest.raises(ValueError, match="Expected readings of as many loops"):
         feedback.step(np.zeros((3, 1)))
+
+
+def test_a_law_of_single_precision_is_fed_by_a_filter_of_double_precision():
+    """P, 10⁻¹² here, would be lost in the rounding of single precision."""
+    controller = controller_of(training={"precision": "float32"})
+    feedback = controller.with_estimator(noise=1e-6)
+    for _ in range(5):
+        u = feedback.step(torch.tensor([0.5]))
+    assert (u.dtype, feedback.belief.P.dtype) == (torch.float32, torch.float64)
+    assert 0 < feedback.belief.P[0, 0] < 1.1e-12

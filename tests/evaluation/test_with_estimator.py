@@ -183,3 +183,9 @@ def test_the_tanks_of_the_page_are_a_task_whose_levels_one_reading_tells():
     assert found.cost_ratio is not None
     assert found.cost_ratio < 1.1
     assert found.errors["upper level (m)"][0] < 1e-3
+
+
+def test_the_loop_of_the_page_runs(capsys):
+    (loop,) = [block for block in blocks("python", ROOT / "docs" / "outputs.md") if "loop.step" in block]
+    exec(loop, {})
+    assert capsys.readouterr().out.startswith("0.02")  # two steps of 0.01 s after the first readings

@@ -19,8 +19,8 @@ class OutputFeedback:
     """y_k ↦ u(t_k, x̂_k), called once in each Δt: x̂_k is the estimate from all readings up to y_k.
 
     The first call is at t = 0: its readings correct the first estimate before the first control. Each further call
-    predicts one step under the control of the call before, and corrects by its readings. States are estimated one by
-    one, in a batch of any shape, which is that of the first readings; computations are in float64.
+    predicts one step under the control of the call before, and corrects by its readings. Each loop of a batch, of the
+    shape of the first readings, has an estimate of its own; computations are in float64.
 
     Args:
         law: u(t, x) with its V, for all t ≥ 0.

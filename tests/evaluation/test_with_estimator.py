@@ -10,6 +10,7 @@ import torch
 import yaml
 
 import lyapnet
+from lyapnet.base.files import plain
 from lyapnet.cli import main
 from lyapnet.evaluation.estimator_figure import states_and_estimates
 from lyapnet.evaluation.tables import evaluation_table
@@ -114,6 +115,9 @@ def test_loops_that_are_lost_are_told():
     found = measure_with_estimator(lost, estimator)
     assert found.lost_fraction == 0.25
     assert found.cost_ratio is None
+    diverged = measure_with_estimator(loops._replace(x_hat=loops.x_hat * torch.nan, cost=lost.cost), estimator)
+    result = {**lyapnet.evaluate(controller, 4, optimum=False), "outputs": plain(diverged._asdict())}
+    assert "not finite" in [*evaluation_table("x", result).columns[1].cells]
 
 
 def test_an_evaluation_has_the_rows_where_outputs_are_measured():

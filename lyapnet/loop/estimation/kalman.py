@@ -24,10 +24,10 @@ from lyapnet.value.derivatives import jacobian_of
 Covariance = Float[Tensor, "*batch n n"]
 Deviations = Float[Tensor, " n"]
 
-AWAKE = (
-    1e-4  # assumed random walk over the horizon, relative to the first uncertainty, where no noise is known or given
-)
-KNOWN = 1e-2  # assumed initial uncertainty of a state that X₀ fixes, relative to its size
+# Random walk over the horizon relative to the first uncertainty, where no noise is known or given. Without any, P of a
+# decaying mode falls below the error of the linearisation: on the balanced cart-pole errors were 100 times P at T.
+AWAKE = 1e-4
+KNOWN = 1e-2  # first uncertainty of a state that X₀ fixes, relative to its size
 
 
 class Belief(NamedTuple):

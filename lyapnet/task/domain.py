@@ -30,14 +30,8 @@ STATES_AT_ONCE = 4096  # states at which functions are evaluated at once, which 
 SEARCH_REACH, SEARCH_PLACES = 8.0, 64  # distance of the search for borders; number of places on it
 HALVINGS = 60  # bisection steps that then locate a border
 TEST_DISTANCES = (1e-6, 1e-3)  # distances beyond a border at which a function must be undefined: excludes poles
-SYSTEM_FUNCTIONS = (
-    "f",
-    "g",
-    "dynamics",
-    "inverse_mass",
-    "noise",
-    "output",
-)  # methods that are evaluated inside the domain
+# methods that are evaluated inside the domain
+SYSTEM_FUNCTIONS = ("f", "g", "dynamics", "inverse_mass", "noise", "output")
 
 
 class Border(NamedTuple):

@@ -120,7 +120,7 @@ def test_commits_in_a_row_have_all_parts(tmp_path):
         else:
             git("commit", "--quiet", "--allow-empty", "-m", f"commit {k}")
         parts.append(part())
-    assert sorted(parts[:PARTS]) == [f"{k}/{PARTS}" for k in range(1, PARTS + 1)]
+    assert set(parts[:PARTS]) == {f"{k}/{PARTS}" for k in range(1, PARTS + 1)}
     assert parts[PARTS] == parts[0]
     assert part("1/1") == "1/1"
     subprocess.run(["git", "clone", "--quiet", "--depth", "1", f"file://{tmp_path}", tmp_path / "shallow"], check=True)

@@ -147,6 +147,7 @@ def test_the_figure_has_a_panel_for_each_state_with_its_unit():
     assert len(figure.axes[0].lines) == len(figure.axes[1].lines) + 1  # the velocity has no readings
 
 
+@pytest.mark.gate
 def test_the_command_measures_outputs_of_any_checkpoint(tmp_path, capsys):
     config = {key: value for key, value in TASK.items() if key not in ("experiment", "outputs")}
     (tmp_path / "task.yaml").write_text(yaml.safe_dump({**config, "training": {"iterations": 1}}))

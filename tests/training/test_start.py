@@ -269,6 +269,7 @@ def drag_without_root(problem):
     return problem.replaced(system=Smooth())
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("sigma", [0.5, 0.1])
 def test_under_strong_noise_training_starts_on_another_way(sigma):
     """Around the wall with a gap, through which the optimum without noise leads."""
@@ -316,6 +317,7 @@ FROM_A_POINT = {
 }
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("measured", [True, False])
 def test_under_noise_V_starts_with_the_mean_of_the_costs_to_go(measured, monkeypatch):
     if not measured:
@@ -341,6 +343,7 @@ def test_a_measured_level_changes_nothing_where_V_is_the_cost_to_go(monkeypatch)
     assert_close(levels[1], levels[0], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("spread", [True, False])
 def test_a_network_can_learn_where_noise_leads_from_a_single_point(spread, monkeypatch):
     if not spread:

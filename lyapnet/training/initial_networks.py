@@ -1,13 +1,17 @@
 """Initialises networks from what is known of V before the first step."""
 
+from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lyapnet.base.errors import DivergenceError
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.types import State, StatePath
+from lyapnet.loop.programs.terms import costs_to_go
 from lyapnet.task.cost import is_quadratic_about_target
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 from lyapnet.training.learner import Learner
 from lyapnet.training.pretraining import typical_cost
@@ -105,6 +109,23 @@ def start_from_zero(learner: Learner, optimum: Optimum) -> None:
     network.start_from_zero(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
     if network.near_borders is not None:
         network.near_borders.fit(expansion.x.flatten(0, 1))
+
+
+@torch.no_grad()
+def raise_to_costs(learner: Learner, x0: State, increments: Increments) -> None:
+    """Change c(t) of a learner's V so that V has the mean of the costs to go at each node of loops under noise.
+
+    What noise adds to V in each step is taken from the costs (see Trajectory.compensated), so that nothing changes
+    where V is the cost to go. The law does not depend on c. Where V is zero at the goal, as the cost to go is, loops
+    are not finite, or curves are smooth, V stays as it is.
+    """
+    network, times = network_of(learner.V), learner.problem.horizon.times(x0)
+    if not isinstance(network, ExpansionNetwork) or network.at_goal:
+        return
+    with suppress(DivergenceError):
+        loops = learner.rollout(x0, increments).compensated()
+        missing = costs_to_go(loops.step_cost, loops.terminal_cost) - loops.require_value()
+        network.raise_by(times, missing.mean(1))
 
 
 def _remove_known_penalty(learner: Learner, expansion: Expansion) -> Expansion:

@@ -9,14 +9,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lyapnet.base.errors import DivergenceError, UsageError
+from lyapnet.base.errors import UsageError
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.types import State
 from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
-from lyapnet.loop.programs.terms import costs_to_go
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import MIN_LOOKAHEAD_GAIN, ZERO_VALUE, Candidate, Start
-from lyapnet.training.initial_networks import network_of, start_from, start_from_zero
+from lyapnet.training.initial_networks import network_of, raise_to_costs, start_from, start_from_zero
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
 from lyapnet.training.pretraining import Examples, draw_examples, fit, fit_briefly, looks_ahead, misfit, relative_misfit
@@ -102,9 +101,6 @@ def choose_start(
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])
     if expansions:
-        if problem.noise is not None and not problem.risk:
-            start_from(learners[0], expansions[base.name], x0)
-            expansions[base.name] = trials.with_measured_level(expansions[base.name])
         for learner in learners:
             start_from(learner, expansions[base.name], x0)
     seeks_optima = _optima_may_help(
@@ -125,6 +121,9 @@ def choose_start(
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
             policy = LookaheadPolicy(problem, policy.V)
             chosen = _fit_for_looking_ahead(learners, list(expansions.values()), drawn, optimum, trials)
+    if trials.increments is not None and not problem.risk:
+        for learner in learners:
+            raise_to_costs(learner, trials.x0, trials.increments)
     # under noise nothing is said of continuous time
     held_cost = chosen.cost if problem.noise is not None else float(costs_of_plant(problem, policy, x0).mean())
     return Start(chosen, [*trials.tried, *trials.left_out], held_cost, gain_ahead)
@@ -331,23 +330,6 @@ class _Trials:
         self.tried.insert(0 if name == ZERO_VALUE else len(self.tried), candidate)
         self.known(candidate)
         return candidate
-
-    @torch.no_grad()
-    def with_measured_level(self, expansion: Expansion) -> Expansion:
-        """An expansion with c(t) such that V has the mean of the costs to go, at each node of loops under noise.
-
-        The learner's V is that of the expansion. What noise adds to V in each step is taken from the costs (see
-        Trajectory.compensated), so that nothing changes where V is the cost to go. The law does not depend on c.
-        """
-        assert self.increments is not None
-        if network_of(self.learner.V).at_goal:  # V is zero at the goal, as the cost to go is
-            return expansion
-        try:
-            loops = self.learner.rollout(self.x0, self.increments).compensated()
-        except DivergenceError:
-            return expansion
-        missing = costs_to_go(loops.step_cost, loops.terminal_cost) - loops.require_value()
-        return expansion._replace(value=expansion.value + missing.double().cpu().mean(1))
 
     def leave_out(self, name: str, missing: Missing) -> None:
         """Report a candidate that does not exist, with the reason."""

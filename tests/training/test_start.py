@@ -18,11 +18,14 @@ from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.programs.terms import costs_to_go
 from lyapnet.task.systems import Linear
 from lyapnet.training import initial_networks, pretraining
+from lyapnet.training import start as start_module
 from lyapnet.training.build import build_module
 from lyapnet.training.candidates import ZERO_VALUE
+from lyapnet.training.initial_networks import raise_to_costs
 from lyapnet.training.optimizer import OptimizerOptions
-from lyapnet.training.start import ANOTHER_WAY, LOOPS_UNDER_NOISE, _Trials, choose_start, expansions_of
+from lyapnet.training.start import ANOTHER_WAY, LOOPS_UNDER_NOISE, choose_start, expansions_of
 from lyapnet.value.expansions import optimal_trajectories
+from lyapnet.value.networks import ExpansionNetwork
 from tests.fits import few_optima
 from tests.marks import sample
 
@@ -321,7 +324,7 @@ FROM_A_POINT = {
 @pytest.mark.parametrize("measured", [True, False])
 def test_under_noise_V_starts_with_the_mean_of_the_costs_to_go(measured, monkeypatch):
     if not measured:
-        monkeypatch.setattr(_Trials, "with_measured_level", lambda self, expansion: expansion)
+        monkeypatch.setattr(start_module, "raise_to_costs", lambda *_: None)
     (learner,), start = started(FROM_A_POINT | {"noise": {"x1": 4.0}})
     assert start.chosen.name == LOOPS_UNDER_NOISE
     path = learner.roll_out(torch.zeros(4096, 1), 5).compensated()
@@ -330,17 +333,15 @@ def test_under_noise_V_starts_with_the_mean_of_the_costs_to_go(measured, monkeyp
 
 
 def test_a_measured_level_changes_nothing_where_V_is_the_cost_to_go(monkeypatch):
-    levels = []
-    measured = _Trials.with_measured_level
-
-    def kept(self, expansion):
-        levels.extend([expansion.value, measured(self, expansion).value])
-        return expansion
-
-    monkeypatch.setattr(_Trials, "with_measured_level", kept)
-    started(LINEAR | {"noise": {"velocity": 0.4}})
-    assert levels[0].max() > 0.9
-    assert_close(levels[1], levels[0], rtol=1e-6, atol=1e-6)
+    rises = []
+    monkeypatch.setattr(ExpansionNetwork, "raise_by", lambda self, t, rise: rises.append(rise))
+    (learner,), _ = started(LINEAR | {"noise": {"velocity": 0.4}})
+    assert learner.V(torch.tensor(0.0), torch.zeros(2)) > 0.9
+    assert rises[0].abs().max() < 1e-5
+    learner.V.expansion.values[:, 0] += 0.1  # the counterpart
+    x0 = torch.zeros(8, 2)
+    raise_to_costs(learner, x0, learner.problem.noise.draw(50, 0.05, x0, torch.Generator().manual_seed(0)))
+    assert_close(rises[1], torch.full((51,), -0.1), rtol=0, atol=1e-5)
 
 
 @pytest.mark.gate

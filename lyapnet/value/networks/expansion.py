@@ -144,6 +144,12 @@ class ExpansionNetwork(ValueFunction):
                 H.copy_((H + H.mT) / 2)
 
     @torch.no_grad()
+    def raise_by(self, t: Tensor, rise: Tensor) -> None:
+        """Add to c(t) a rise given at nodes t (K,); curves that are smooth in time stay as they are."""
+        if isinstance(self.expansion, Curve):
+            self.expansion.values[:, 0] += Curve(t, rise[:, None])(self.expansion.nodes)[:, 0]
+
+    @torch.no_grad()
     def start_from_zero(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
         """Initialise at V = 0, with the inputs of N scaled by a spread around a centre; training may change V(x*).
 

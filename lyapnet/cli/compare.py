@@ -113,7 +113,7 @@ def _report(
     from lyapnet.base.tables import terminal
     from lyapnet.lab.comparison.execution import controllers_of
     from lyapnet.lab.comparison.plan import begun_jobs, jobs_of
-    from lyapnet.lab.comparison.report import brief_alternatives, summary, write_report
+    from lyapnet.lab.comparison.report import brief_alternatives, mean_costs, summary, write_report
     from lyapnet.lab.comparison.results import PLANNED, with_cold_compilation, with_common_optima
     from lyapnet.lab.comparison.statistics import compared
 
@@ -135,6 +135,8 @@ def _report(
         console.print(terminal(summary(learned)))
     if set(PLANNED).intersection(comparison.methods):
         console.print(terminal(brief_alternatives(comparison)))
+    if (noisy := mean_costs(comparison)) is not None:
+        console.print(terminal(noisy))
     if lacking := len(planned) - len(results):
         console.print(f"{lacking} of {len(planned)} jobs are missing; the same command goes on", soft_wrap=True)
     console.print(f"wrote {wrote[0]} and {len(wrote) - 1} files beside it", soft_wrap=True)

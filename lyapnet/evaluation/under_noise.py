@@ -12,13 +12,13 @@ from torch import Tensor
 from lyapnet.base.random_streams import NOISE, TEST, stream
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
+from lyapnet.evaluation.intervals import half_width_of_mean
 from lyapnet.evaluation.oracles import Report, silent
 from lyapnet.evaluation.references import costs_of_lqr
 from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 from lyapnet.loop.rollout import NoisyTrajectory
 from lyapnet.value.risk import mean_with_risk
 
-CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
 ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in a mean of exponentials
 FAR_FROM_ONE = 0.1  # distance from 1 of a sample's mean whose expectation is 1, at which it says nothing
@@ -93,12 +93,12 @@ def measure_under_noise(
         if (factor > 0).all():
             equivalent = table.value + (factor.log() / problem.risk).to(table.value)
             table, with_risk = replace(table, cost=equivalent), float(equivalent[:counted].mean())
-            half_width = _half_width((growth / (problem.risk * factor))[:, :counted])
+            half_width = half_width_of_mean((growth / (problem.risk * factor))[:, :counted])
     levels = np.quantile(
         J.double().numpy(force=True), QUANTILES, method="inverted_cdf"
     ).tolist()  # of finite costs or not
     measures = NoiseMeasures(
-        paths, float(cost.mean()), _half_width(cost), float(J.mean()), _half_width(J),
+        paths, float(cost.mean()), half_width_of_mean(cost), float(J.mean()), half_width_of_mean(J),
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
         float(_mean_of_dearest(J).mean()),
         float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
@@ -137,25 +137,6 @@ def _mean_of_dearest(J: Tensor) -> PerState:
     count = DEAREST * len(J)
     share = (count - torch.arange(len(J)).to(J)).clamp(0, 1)[: math.ceil(count)]
     return (J.sort(0, descending=True).values[: len(share)] * share[:, None]).sum(0) / count
-
-
-def _half_width(samples: Tensor) -> float:
-    """The half-width of the 95 % interval of the mean over the states of expectations, from samples (paths, states).
-
-    By Student's t, with the degrees of freedom of a sum of variances.
-
-    Source: Welch, "The generalization of 'Student's' problem when several different population variances are involved",
-    Biometrika 1947.
-    """
-    if len(samples) < 2 or not samples.isfinite().all():
-        return math.inf
-    variances = samples.double().var(0) / len(samples)  # of the mean of each state
-    if not (total := float(variances.sum())):
-        return 0.0
-    from scipy.special import stdtrit  # imported here because it takes 0.2 s
-
-    freedom = (len(samples) - 1) * total**2 / float((variances**2).sum())
-    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * math.sqrt(total) / samples.shape[1]
 
 
 AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits")  # columns of a table that are averaged over paths

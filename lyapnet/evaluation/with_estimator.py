@@ -11,7 +11,8 @@ from lyapnet.base.random_streams import NOISE, OUTPUTS, PLANTS, TEST, stream
 from lyapnet.base.types import PerState, State, StatePath, Times
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.output_feedback import OutputFeedback
-from lyapnet.evaluation.under_noise import CONFIDENCE, LOST_EXCESS
+from lyapnet.evaluation.intervals import CONFIDENCE
+from lyapnet.evaluation.under_noise import LOST_EXCESS
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.value.expansions import path_under

@@ -15,10 +15,11 @@ from lyapnet.claims.sampling_certificates import StatisticalCertificate
 from lyapnet.claims.statistical import count_successes
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
+from lyapnet.evaluation.intervals import half_width_of_mean
 from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.tables import evaluation_table
-from lyapnet.evaluation.under_noise import _half_width, _mean_of_dearest, measure_under_noise
+from lyapnet.evaluation.under_noise import _mean_of_dearest, measure_under_noise
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.rollout import Rollout
@@ -287,15 +288,15 @@ def test_a_trajectory_with_another_field_keeps_its_martingale():
 def test_an_interval_covers_the_mean_in_95_percent_of_draws_also_for_few_paths(states, paths):
     draws = torch.randn(4000, paths, states, dtype=torch.float64, generator=seeded(0))
     draws = draws * torch.linspace(0.5, 2, states)
-    covered = [abs(float(draw.mean())) <= _half_width(draw) for draw in draws]
+    covered = [abs(float(draw.mean())) <= half_width_of_mean(draw) for draw in draws]
     assert 0.94 < sum(covered) / 4000 < 0.975
     normal = [abs(float(draw.mean())) <= 1.96 * float(draw.var(0).sum().div(paths).sqrt()) / states for draw in draws]
     assert states * (paths - 1) > 20 or sum(normal) < sum(covered) - 80
 
 
 def test_an_interval_of_an_infinite_cost_is_infinite_and_of_equal_costs_zero():
-    assert _half_width(torch.tensor([[1.0], [torch.inf]])) == torch.inf
-    assert _half_width(torch.ones(3, 2)) == 0
+    assert half_width_of_mean(torch.tensor([[1.0], [torch.inf]])) == torch.inf
+    assert half_width_of_mean(torch.ones(3, 2)) == 0
 
 
 def of_root() -> Problem:

@@ -4,6 +4,7 @@ Importing this registers them: gymnasium.make("lyapnet.lab.comparison.environmen
 itself.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,8 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from jaxtyping import Float
+from torch import Tensor
 
 from lyapnet.base.errors import DivergenceError, UsageError
 from lyapnet.base.types import PerState, State
@@ -25,6 +28,8 @@ class Episodes:
     F is the problem's step with u held, x_n + Δt(f + gu) with Euler. A control outside U is projected onto it. The
     reward of step n is what it costs, −Δt ℓ(x_n, u_n) with Euler, and −φ(x_N) with the last: an episode's undiscounted
     return is −J_N(x₀).
+
+    With noise x_{n+1} = F(x_n, u_n) + σ(x_n)ΔW_n, by Euler–Maruyama as in training, and a return is that of one path.
     """
 
     def __init__(self, bounded: BoundedProblem, observe_time: bool):
@@ -41,12 +46,18 @@ class Episodes:
         """Begin at x₀ (*batch, n)."""
         self.state, self.step = x0, 0
 
-    def advance(self, action: np.ndarray) -> PerState:
+    def advance(self, action: np.ndarray, increment: Float[Tensor, "*batch sources"] | None = None) -> PerState:
         """One step; the rewards (*batch,).
 
+        Args:
+            increment: ΔW of the step in √s; None: the task has no noise.
+
         Raises:
-            ValueError: actions of another shape.
+            ValueError: actions of another shape; or noise without ΔW, or ΔW without noise.
         """
+        noise = self.problem.noise
+        if (noise is None) != (increment is None):
+            raise ValueError("Expected increments with a task that has noise, and none with another; correct the call.")
         given = torch.tensor(np.asarray(action)).to(self.scale)
         if given.shape != (*self.state.shape[:-1], len(self.scale)):
             raise ValueError(
@@ -56,7 +67,10 @@ class Episodes:
         self.clipped += int((given.abs() >= 1).sum())  # at the bound: learners clip before they ask
         self.controls += given.numel()
         self.control = self.problem.controls.project(self.scale * given.clamp(-1, 1))
-        self.state, paid = self.problem.step(self.state, self.control)
+        following, paid = self.problem.step(self.state, self.control)
+        if noise is not None and increment is not None:
+            following = following + noise.displacement(self.state, increment)
+        self.state = following
         self.step += 1
         return -paid - self.problem.cost.terminal(self.state) if self.over else -paid
 
@@ -100,6 +114,8 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     The observation is x, in the units of the system, and the action a ∈ [−1, 1]^m: u = control_scale · a, in the units
     of the control. `state` is x; info holds "control", the u that was applied, and "clipped", whether some a_i was at
     or beyond its bound. `reset(options={"state": x0})` starts from x₀ instead of drawing it from X₀.
+
+    A task with noise draws it from `np_random`, after x₀: the seed of `reset` tells the whole path.
 
     Args:
         task: a reference task by name, a config file, or a Problem; lyapnet/Task-v0 makes an environment of any.
@@ -165,8 +181,16 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
             self._picture.begin(self.state)
         return self._episode.observation, {}
 
+    def _increment(self) -> Tensor | None:
+        """ΔW of the next step, (k,); None without noise."""
+        noise, dt = self.problem.noise, self.problem.horizon.dt
+        if noise is None:
+            return None
+        drawn = math.sqrt(dt) * self.np_random.standard_normal(noise.sources)
+        return torch.from_numpy(drawn).to(self._episode.state)
+
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        reward = float(self._episode.advance(action))
+        reward = float(self._episode.advance(action, self._increment()))
         self._episode.require_finite()
         info = {"control": self._episode.control.numpy().copy(), "clipped": bool((np.abs(action) >= 1).any())}
         if self._picture is not None:

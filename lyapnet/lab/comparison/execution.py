@@ -26,7 +26,7 @@ from lyapnet.lab.comparison.controller_policy import ControllerPolicy
 from lyapnet.lab.comparison.plan import RESULT, Job
 from lyapnet.lab.comparison.planners import PlannerPolicy, planner_of
 from lyapnet.lab.comparison.results import OURS, PLANNED, ControlTimes, Measurement, Result
-from lyapnet.lab.comparison.scoring import Costs, costs_of, optima_of
+from lyapnet.lab.comparison.scoring import Costs, PathIncrements, costs_of, increments_of, optima_of
 from lyapnet.lab.comparison.timing import times_of_controller, times_of_policy
 from lyapnet.lab.sweep.points import Point
 from lyapnet.training.runs import TrainingRun
@@ -80,10 +80,13 @@ def require_same(job: Job) -> None:
 def _description(job: Job) -> dict[str, Any]:
     """What a result depends on."""
     evaluation = [job.comparison.evaluation_states, job.comparison.evaluation_seed]
-    config, scale = to_plain(job.config), job.bounded.control_scale
+    config, bounded = to_plain(job.config), job.bounded
+    scale = bounded.control_scale
+    if bounded.problem.noise is not None:
+        evaluation.append(job.comparison.evaluation_paths)
     if job.method == OURS:
         return {"evaluation": evaluation, "control_scale": scale, "config": {**config, "logs": ""}}
-    task = [config[key] for key in ("system", "cost", "controls", "initial_states", "horizon")]
+    task = [config[key] for key in ("system", "cost", "controls", "initial_states", "horizon", "noise")]
     method = {} if job.method in PLANNED else job.baseline.description
     return {"evaluation": evaluation, "control_scale": scale, "task": task, **method}
 
@@ -95,23 +98,24 @@ def _with_defaults(kept: dict[str, Any]) -> dict[str, Any]:
     if len(kept["task"]) == 4:
         system, cost, initial_states, horizon = kept["task"]
         task = [system, {**asdict(CostConfig()), **cost}, asdict(ControlsConfig()), initial_states, horizon]
-        return {**kept, "task": task}
-    return kept
+        kept = {**kept, "task": task}
+    return {**kept, "task": [*kept["task"], {}]} if len(kept["task"]) == 5 else kept  # which was without noise
 
 
 def _lyapnet(job: Job, console: Console) -> Result:
     from lyapnet.training.experiment import train  # Lightning takes seconds to import: baselines do without
 
-    config, bounded, states = job.config, job.bounded, _states(job)
+    config, bounded, states, increments = job.config, job.bounded, *_states(job)
     point = Point(Path(job.compared.config), job.settings)
     run = point.run()
     if run is None or not run.finished:
         last = None if run is None or not run.last.is_file() else str(run.last)
         run = train(point.path, point.settings, resume=last, console=console)
     controller = _controller(job, run.best)
-    costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states)
+    costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states, increments)
     with torch.no_grad():
-        constraint_loss = measure(controller.problem, controller.program, controller.rollout(states)).constraint_loss
+        loops = controller.rollout(states, noise=None if increments is None else increments[:, 0])
+        constraint_loss = measure(controller.problem, controller.program, loops).constraint_loss
     record = run.record()
     compilation, start = record.get("compilation_seconds", 0.0), record.get("start", {}).get("seconds", {})
     before = compilation + max(start.values(), default=0.0)
@@ -160,7 +164,7 @@ def _validations(run: TrainingRun, steps: int, before: float) -> list[Measuremen
 
 
 def _baseline(job: Job, console: Console) -> Result:
-    baseline, states = job.baseline, _states(job)
+    baseline, states, increments = job.baseline, *_states(job)
     training = BaselineTraining(baseline, job.folder)
 
     def report(point: Measurement) -> None:
@@ -169,28 +173,29 @@ def _baseline(job: Job, console: Console) -> Result:
 
     training.run(report)
     path, policy = best_policy(baseline, job.folder)
-    costs = costs_of(policy, job.bounded, baseline.setting.observe_time, states)
+    costs = costs_of(policy, job.bounded, baseline.setting.observe_time, states, increments)
     times = times_of_policy(policy, job.bounded, baseline.setting.observe_time, states)
     return _result(job, states, costs, str(path), training.curve, times=times)
 
 
 def _planner(job: Job, console: Console) -> Result:
-    bounded, states = job.bounded, _states(job)
+    bounded, states, increments = job.bounded, *_states(job)
     began = time.process_time()
     policy = PlannerPolicy(planner_of(job.method, bounded.problem), bounded)
     prepared = time.process_time() - began
-    costs = costs_of(policy, bounded, True, states)
+    costs = costs_of(policy, bounded, True, states, increments)
     console.print(f"{job.name}: mean cost {float(costs.cost.mean()):.4g}", soft_wrap=True)
     return _result(
         job, states, costs, "", [], seconds=prepared, times=policy.times, unsolved_fraction=policy.unsolved_fraction
     )
 
 
-def _states(job: Job) -> State:
-    """The evaluation states: the same for every method and seed."""
-    comparison = job.comparison
-    draw = stream(comparison.evaluation_seed, TEST)
-    return job.bounded.problem.initial_states.sample(comparison.evaluation_states, draw)
+def _states(job: Job) -> tuple[State, PathIncrements | None]:
+    """The evaluation states, and paths of noise from each: the same for every method and seed."""
+    comparison, bounded = job.comparison, job.bounded
+    seed = comparison.evaluation_seed
+    states = bounded.problem.initial_states.sample(comparison.evaluation_states, stream(seed, TEST))
+    return states, increments_of(bounded, states, comparison.evaluation_paths, seed, TEST)
 
 
 def _result(
@@ -223,4 +228,5 @@ def _result(
         curve=validations,
         times=times,
         unsolved_fraction=unsolved_fraction,
+        path_costs=None if costs.paths is None else costs.paths.tolist(),
     )

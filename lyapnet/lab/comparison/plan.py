@@ -47,13 +47,16 @@ class ComparisonConfig:
 
     comparison: str = setting("compare", "Its name: everything goes to <logs>/<comparison>.", folder=True)
     logs: str = setting("logs", "The folder of all runs.")
-    methods: list[str] = setting(list(LEARNED), "What is compared; lqr, ilqr, mpc_10, mpc_25 and mpc_100 too.")
+    methods: list[str] = setting(list(LEARNED), f"What is compared; {', '.join(PLANNED)} too.")
     seeds: int = setting(5, "Seeds of lyapnet: 0, 1, …", at_least=1)
     baseline_seeds: int = setting(3, "Seeds of each baseline.", at_least=1)
     evaluation_states: int = setting(
         256, "States of X₀ on which all methods are measured, the same for all.", at_least=1
     )
-    evaluation_seed: int = setting(0, "Seed with which those states are drawn.", at_least=0)
+    evaluation_paths: int = setting(
+        32, "Paths of noise from each of them, the same for all methods, where a task has noise.", at_least=2
+    )
+    evaluation_seed: int = setting(0, "Seed with which those states and paths are drawn.", at_least=0)
     tasks: dict[str, ComparedTask] = setting({}, "What they are compared on, by name.")
 
     @property

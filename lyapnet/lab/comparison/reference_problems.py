@@ -68,8 +68,8 @@ def bounded_problem(
         control_scale: max |u_i| in the units of the control, one for each; known for the reference tasks.
 
     Raises:
-        UsageError: no such task or file, none, or one with state constraints or noise; or no scale, one of another
-            length, or one that is not positive.
+        UsageError: no such task or file, none, or one with state constraints, or with noise and a risk; or no scale,
+            one of another length, or one that is not positive.
     """
     given = [control_scale] if isinstance(control_scale, int | float) else control_scale
     scale = CONTROL_SCALES.get(str(task)) if given is None else given
@@ -79,10 +79,10 @@ def bounded_problem(
             "Expected a task without state constraints for an environment, got some; its reward does not know of them: "
             "leave constraints out."
         )
-    if built.noise is not None:
+    if built.noise is not None and built.risk:
         raise UsageError(
-            "Expected a task without noise for an environment, got some; its steps and the methods compared know none: "
-            "leave noise out."
+            f"Expected a task without risk for an environment, got {built.risk:g}; its rewards add up to a cost, of "
+            "which learners take the mean: leave risk out."
         )
     m, names = built.system.m, ", ".join(built.system.control_labels)
     if scale is None:

@@ -13,7 +13,7 @@ from lyapnet.base.files import read_file, write_json
 
 OURS = "lyapnet"
 LEARNED = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
-PLANNED = ("lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100")  # from the model, without training; MPC: its horizon in % of T
+PLANNED = ("rest", "lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100")  # from the model, without training; MPC: % of T
 METHODS = (*LEARNED, *PLANNED)  # the order of tables and figures
 
 
@@ -63,6 +63,7 @@ class Result:
     curve: Sequence[Measurement]  # empty without training
     times: ControlTimes | None = None
     unsolved_fraction: float | None = None  # of the optimisations of a planner, that did not converge
+    path_costs: Sequence[Sequence[float]] | None = None  # J_N of each path of noise (paths, states); `costs` are means
 
     def write(self, path: Path) -> None:
         """As JSON, all or nothing: its presence says that the job is finished."""
@@ -98,10 +99,13 @@ def with_common_optima(results: Sequence[Result]) -> list[Result]:
     """The results with the least optimum of each state that any job knew, or its method reached.
 
     The oracle keeps the best local minimum that it has met; a method that costs less has found a better one. Where none
-    was found, none is known, whatever methods reach.
+    was found, none is known, whatever methods reach. With noise costs are means over paths, which may be below the
+    optimum by chance: results stay as they are.
     """
     known: dict[str, torch.Tensor] = {}
     for result in results:
+        if result.path_costs is not None:
+            continue
         if result.optima is not None:
             optima = torch.tensor(result.optima, dtype=torch.float64)
             known[result.task] = torch.fmin(known.get(result.task, optima), optima)

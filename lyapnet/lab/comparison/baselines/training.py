@@ -34,9 +34,10 @@ from lyapnet.lab.comparison.baselines.checkpoints import (
     checkpoints,
 )
 from lyapnet.lab.comparison.results import Measurement
-from lyapnet.lab.comparison.scoring import costs_of, optima_of
+from lyapnet.lab.comparison.scoring import costs_of, increments_of, optima_of
 
 VALIDATION_STATES = 64  # those of a lyapnet run of the same seed
+VALIDATION_PATHS = 4  # of noise from each
 
 
 class BaselineTraining:
@@ -46,6 +47,7 @@ class BaselineTraining:
         self.baseline, self.folder = baseline, folder
         initial_states = baseline.bounded.problem.initial_states
         self.states = initial_states.sample(VALIDATION_STATES, stream(baseline.seed, VALIDATION))
+        self.increments = increments_of(baseline.bounded, self.states, VALIDATION_PATHS, baseline.seed, VALIDATION)
         self.optima = optima_of(baseline.bounded, self.states)
         self.episodes, self.seconds, self.best = baseline.environment(), 0.0, 0
         self.curve: list[Measurement] = []
@@ -95,7 +97,7 @@ class BaselineTraining:
     def _validate(self) -> Measurement:
         """The policy on the validation states, logged under the tags of a lyapnet run."""
         setting, model = self.baseline.setting, self.model
-        costs = costs_of(self.policy, self.baseline.bounded, setting.observe_time, self.states)
+        costs = costs_of(self.policy, self.baseline.bounded, setting.observe_time, self.states, self.increments)
         cost = float(costs.cost.mean())
         ratio = None if self.optima is None else ratio_of_means(costs.cost, self.optima)
         scalars = {

@@ -25,7 +25,7 @@ class VectorEnvironment(VecEnv):
         truncates: whether the end of the horizon is called a truncation, as for Environment. SB3 then adds its own
             estimate of what lies beyond it, which is right for a task that goes on and wrong for J_N: with false, the
             return that is learned is −J_N.
-        seed: for the draws from X₀.
+        seed: for the draws from X₀, and of noise.
     """
 
     def __init__(
@@ -62,7 +62,10 @@ class VectorEnvironment(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        rewards = self.episodes.advance(self._actions).numpy()
+        problem, x = self.episodes.problem, self.episodes.state
+        noise = problem.noise
+        increment = None if noise is None else noise.draw(1, problem.horizon.dt, x, self.generator)[0]
+        rewards = self.episodes.advance(self._actions, increment).numpy()
         self.episodes.require_finite()
         applied = zip(self.episodes.control.numpy(), np.abs(self._actions), strict=True)
         infos: list[dict[str, Any]] = [{"control": u, "clipped": bool((a >= 1).any())} for u, a in applied]

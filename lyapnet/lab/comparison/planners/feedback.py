@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lyapnet.base.errors import UsageError
 from lyapnet.lab.comparison.planners.planner import LoopLaw, Planner
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import (
@@ -17,8 +18,21 @@ from lyapnet.value.expansions import (
 )
 
 
+class Rest(Planner):
+    """The control of U nearest to that which costs nothing."""
+
+    def __init__(self, problem: Problem):
+        self.u = problem.controls.project(problem.rest).double().cpu().numpy()
+
+    def law(self) -> LoopLaw:
+        return lambda step, x: self.u
+
+
 class Regulator(Planner):
-    """LQR: u_n = ū_n + K_n(x − x*) of the task linearised at its goal, for its own horizon; U is not known to it."""
+    """LQR: u_n = ū_n + K_n(x − x*) of the task linearised at its goal, for its own horizon; U is not known to it.
+
+    Noise changes K only where σ depends on x.
+    """
 
     def __init__(self, problem: Problem):
         self.goal = problem.goal.double().cpu().numpy()
@@ -32,9 +46,17 @@ class IterativeRegulator(Planner):
     """iLQR, with second derivatives at the end, from x₀ at t = 0; its plan is then followed, the plant being the model.
 
     It is begun twice, with the control that costs nothing and with LQR's, and the cheaper of the two plans is taken.
+
+    Raises:
+        UsageError: the task has noise, under which nobody follows a plan without feedback.
     """
 
     def __init__(self, problem: Problem):
+        if problem.noise is not None:
+            raise UsageError(
+                "Expected a task without noise for ilqr, got some; its plan has no feedback: leave it out of methods, "
+                "or take mpc_100, which plans again at each step."
+            )
         self.problem, self.linear = in_float64(problem), riccati(problem)
 
     def law(self) -> LoopLaw:

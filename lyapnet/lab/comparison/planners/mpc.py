@@ -23,7 +23,8 @@ class PredictiveControl(Planner):
     are left: those beyond T leave x where it is and cost what u is off its rest, so that one solver serves all steps
     and T is where it is. With H = N it is the optimal law, but for local minima. A plan is warm-started with the last
     one, a step later; the first begins with the straight line to the goal and the control that costs nothing. Of a
-    solve that does not converge, the last iterate is the plan.
+    solve that does not converge, the last iterate is the plan. Noise is unknown to the plan, which is made again at
+    each step: certainty-equivalent control.
 
     Args:
         problem: the task; its constraints are not known here.

@@ -2,6 +2,7 @@
 
 from lyapnet.lab.comparison.report.alternatives import brief_alternatives
 from lyapnet.lab.comparison.report.details import summary
+from lyapnet.lab.comparison.report.mean_costs import mean_costs
 from lyapnet.lab.comparison.report.writing import write_report
 
-__all__ = ["brief_alternatives", "summary", "write_report"]
+__all__ = ["brief_alternatives", "mean_costs", "summary", "write_report"]

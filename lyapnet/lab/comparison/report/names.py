@@ -1,7 +1,7 @@
 """Names of tasks and methods for readers."""
 
 ALGORITHMS = {"ppo": "PPO", "sac": "SAC"}
-PLANNERS = {"lqr": "LQR", "ilqr": "iLQR"}
+PLANNERS = {"rest": "no control", "lqr": "LQR", "ilqr": "iLQR"}
 
 
 def name_of(task: str) -> str:

@@ -21,6 +21,12 @@ NOTES = (
     "optimum; that of J/J*, state by state, does not. Agarwal et al., NeurIPS 2021.",
     "cost / J*: mean cost over mean optimum of the states whose optimum is known. The optimum is that of J_N; of the "
     "sum form it is not computed.",
+    "Under noise a cost is the mean over paths of it from a state, the same paths for every method. ± is the "
+    "half-width of the 95 % interval of E J for these states and seeds. Above the least: the mean difference on the "
+    "same paths from the method that costs least there, which need not be the optimum. J* is then the least expected "
+    "cost, known for linear-quadratic tasks alone. LQR and MPC plan as if there were no noise (certainty "
+    "equivalence), MPC again at each step; where σ depends on x, LQR's gain and the value that MPC adds at the end of "
+    "its horizon know it.",
     "To 10 % and 2 %: the first validation whose cost on the validation states is within that of their optimum; later "
     "ones may be worse again. Median over all the seeds, known where more than half of them got there.",
     "Our convergence: the median over our seeds of the environment steps to 2 %; their mean there may be above. "

@@ -6,6 +6,9 @@ from math import isfinite
 from statistics import stdev
 from typing import Any
 
+import torch
+
+from lyapnet.evaluation.intervals import half_width_of_mean
 from lyapnet.lab.comparison.report.names import method_name, name_of
 from lyapnet.lab.comparison.results import METHODS, Result
 from lyapnet.lab.comparison.statistics import (
@@ -37,7 +40,7 @@ def missing(comparison: Comparison, planned: Iterable[tuple[str, str, int]] = ()
         *(
             f"{name_of(task)}: J*, which no job knew; new ones find it with lyapnet[oracle]"
             for task, known in optima.items()
-            if known.count(None) == len(known)
+            if known.count(None) == len(known) and not any(group.under_noise for group in comparison.of_task(task))
         ),
     ]
 
@@ -75,6 +78,8 @@ def _result_row(result: Result) -> dict[str, Any]:
         "cost_mean": costs.mean,
         "cost_std": stdev(result.costs) if len(result.costs) > 1 and isfinite(costs.mean) else None,
         "cost_iqm": costs.iqm,
+        "paths": result.path_costs and len(result.path_costs),
+        "cost_half_width": result.path_costs and half_width_of_mean(torch.tensor(result.path_costs)),
         "sum_mean": sums.mean,
         "sum_iqm": sums.iqm,
         "optimum_mean": optimum(result),

@@ -18,6 +18,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.lab.comparison.report.alternatives import alternatives
 from lyapnet.lab.comparison.report.details import details, overview, tasks_table
 from lyapnet.lab.comparison.report.figures import caption, figure3, final, pictures
+from lyapnet.lab.comparison.report.mean_costs import mean_costs
 from lyapnet.lab.comparison.report.notes import NOTES
 from lyapnet.lab.comparison.report.rows import curve_rows, missing, result_rows
 from lyapnet.lab.comparison.report.table1 import table1
@@ -53,6 +54,8 @@ def write_report(
     if not comparison.groups:
         raise UsageError("Expected at least one finished job to report on, got none; run lyapnet compare first.")
     learned, figures, tables = comparison.without(PLANNED), {}, {"alternatives": [alternatives(comparison)]}
+    if (noisy := mean_costs(comparison)) is not None:
+        tables["mean_costs"] = [noisy]
     if learned.groups:
         figures = {"figure3": figure3(learned), "final": final(learned), **pictures(controllers or {})}
         tables |= {"table1": table1(learned), "details": [tasks_table(learned), details(learned)]}
@@ -107,7 +110,7 @@ def report_text(
         f"```bash\n{command}\n```",
         "\n".join([f"- {fact}" for fact in _facts()]),
         *(["**Missing so far**", "\n".join(f"- {line}" for line in lacking)] if lacking else []),
-        *map(markdown, tables["alternatives"]),
+        *map(markdown, [*tables["alternatives"], *tables.get("mean_costs", ())]),
         *_of_learning(comparison.without(PLANNED), tables, figures),
         *_notes(),
         "Every result: [results.csv](results.csv); every validation: [curves.csv](curves.csv).",

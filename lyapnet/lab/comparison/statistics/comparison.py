@@ -115,6 +115,7 @@ def _require_equal_states(results: Sequence[Result]) -> None:
     first = next((result for result in results if result.optima is not None), results[0])
     for result in results:
         alike = len(result.costs) == len(result.sums) == len(first.costs)
+        alike = alike and np.shape(result.path_costs or ()) == np.shape(first.path_costs or ())
         if alike and first.optima is not None and result.optima is not None:
             here, there = np.asarray(result.optima, dtype=float), np.asarray(first.optima, dtype=float)
             both = np.isfinite(here) & np.isfinite(there)

@@ -7,6 +7,10 @@ from functools import cached_property
 from statistics import fmean, median
 from typing import NamedTuple
 
+import torch
+from torch import Tensor
+
+from lyapnet.evaluation.intervals import half_width_of_mean
 from lyapnet.lab.comparison.results import Result
 from lyapnet.lab.comparison.statistics.one_result import (
     best_until,
@@ -83,6 +87,29 @@ class Group:
         ratios = [relative_costs(result) for result in self.results]
         known = [one for one in ratios if one is not None]
         return spread(known) if len(known) == len(ratios) else None
+
+    @property
+    def under_noise(self) -> bool:
+        """Whether costs are means over paths of noise."""
+        return all(result.path_costs is not None for result in self.results)
+
+    @cached_property
+    def path_costs(self) -> Tensor:
+        """The cost of each path of noise from each state, (paths, states), mean over the seeds."""
+        return torch.tensor([result.path_costs for result in self.results], dtype=torch.float64).mean(0)
+
+    @property
+    def half_width(self) -> float:
+        """The half-width of the 95 % interval of the mean cost under noise, for these seeds and states."""
+        return half_width_of_mean(self.path_costs)
+
+    def cost_above(self, other: "Group") -> tuple[float, float]:
+        """By how much its mean cost is above that of another method, and the half-width of its 95 % interval.
+
+        Both costs are of the same paths of noise, whose luck the difference does not have.
+        """
+        difference = self.path_costs - other.path_costs
+        return self.cost.mean - other.cost.mean, half_width_of_mean(difference)
 
     @property
     def optimum(self) -> float | None:

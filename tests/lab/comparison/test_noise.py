@@ -33,7 +33,7 @@ from lyapnet.lab.comparison.statistics import compared
 from lyapnet.task.cost import QuadraticCost, TargetCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.noise import StateNoise
-from lyapnet.task.sets import Box, Unbounded
+from lyapnet.task.sets import ControlBox, Unbounded
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.policy import HJBPolicy
 from tests.problems import CONF, Quadratic, problem_of
@@ -210,7 +210,7 @@ def test_certainty_equivalent_control_does_not_know_the_noise():
 
 def test_no_control_is_that_which_costs_nothing():
     cost = TargetCost(QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2)), [0.0, 0.0], [0.7])
-    for controls, u in ((Unbounded(), 0.7), (Box([-0.5], [0.5]), 0.5)):
+    for controls, u in ((Unbounded(), 0.7), (ControlBox([-0.5], [0.5]), 0.5)):
         law = planner_of("rest", problem_of(DoubleIntegrator(), cost, controls=controls)).law()
         assert law(0, np.ones(2)) == law(7, np.zeros(2)) == pytest.approx(u)
 

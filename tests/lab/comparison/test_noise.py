@@ -3,6 +3,7 @@
 import csv
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -22,7 +23,7 @@ from lyapnet.lab.comparison.baselines.vector_environment import VectorEnvironmen
 from lyapnet.lab.comparison.controller_policy import ControllerPolicy
 from lyapnet.lab.comparison.environments import Environment, Episodes
 from lyapnet.lab.comparison.execution import require_same, run_job
-from lyapnet.lab.comparison.plan import job_named, load_comparison
+from lyapnet.lab.comparison.plan import job_named, jobs_of, load_comparison
 from lyapnet.lab.comparison.planners import PlannerPolicy, planner_of
 from lyapnet.lab.comparison.reference_problems import bounded_problem
 from lyapnet.lab.comparison.report import mean_costs, write_report
@@ -37,6 +38,7 @@ from lyapnet.task.sets import ControlBox, Unbounded
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.policy import HJBPolicy
 from tests.problems import CONF, Quadratic, problem_of
+from tests.tasks_without_goal.tasks import inside
 
 SIGMA = [0.1, 0.5]
 
@@ -281,6 +283,23 @@ def test_other_numbers_of_paths_are_not_compared():
 def test_a_result_keeps_its_paths(tmp_path):
     LQR.write(tmp_path / "result.json")
     assert Result.read(tmp_path / "result.json") == LQR
+
+
+@pytest.mark.parametrize(
+    ("folder", "file", "tasks"),
+    [
+        (".", "conf/compare_noise.yaml", {"pendulum"}),
+        (".", "tests/noise_tasks/compare.yaml", {"van_der_pol", "planar_quadrotor"}),
+        ("tests/noise_tasks/walker", "compare.yaml", {"gap"}),
+    ],
+)
+def test_comparisons_of_noisy_tasks_can_be_run(folder, file, tasks):
+    """Where their first line says."""
+    with inside(CONF.parent / folder):
+        jobs = jobs_of(load_comparison(file))
+        assert {job.task for job in jobs} == tasks
+        assert all(job.bounded.problem.noise is not None for job in jobs)
+        assert f"lyapnet compare --config {file}" in Path(file).read_text(encoding="utf-8").splitlines()[0]
 
 
 # What is refused

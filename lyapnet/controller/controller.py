@@ -17,7 +17,13 @@ from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
 from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
-from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of
+from lyapnet.experiment.assembly.outputs import (
+    build_outputs,
+    check_outputs,
+    deviation_of,
+    drift_of,
+    problem_of_estimator,
+)
 from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
 from lyapnet.experiment.schema import check_values
 from lyapnet.loop.programs import Program, ValueProgram
@@ -275,6 +281,7 @@ class Controller:
         measure: Sequence[str] | None = None,
         noise: Sequence[float] | float | None = None,
         process_noise: Mapping[str, float] | None = None,
+        input_disturbances: Mapping[str, float] | None = None,
         initial_deviation: Sequence[float] | float | None = None,
     ) -> OutputFeedback:
         """The controller for states that are not measured: y ↦ u(t, x̂) with a Kalman filter; see OutputFeedback.
@@ -286,6 +293,8 @@ class Controller:
             measure: names of the measured states; empty: the readings of the system's method output(x).
             noise: standard deviation of each reading, in its unit; one number for all measured states.
             process_noise: random walk assumed of states, by name, in the unit per √s.
+            input_disturbances: constant disturbances of controls, by name, that are estimated and taken off; each with
+                the random walk assumed of it, in its unit per √s.
             initial_deviation: standard deviation of the first estimate of each state.
 
         Raises:
@@ -295,6 +304,7 @@ class Controller:
             "measure": None if measure is None else [*measure],
             "noise": _listed(noise),
             "process_noise": None if process_noise is None else dict(process_noise),
+            "input_disturbances": None if input_disturbances is None else dict(input_disturbances),
             "initial_deviation": _listed(initial_deviation),
         }
         known = OutputsConfig() if self._config is None else self._config.outputs
@@ -302,6 +312,8 @@ class Controller:
         check_values(section, "outputs.")
         plants = self.plants
         problem = self.problem if plants is None else plants.problem
+        check_outputs(section, copied(problem))
+        problem = problem_of_estimator(section, problem)
         exact = copied(problem)
         outputs = build_outputs(section, exact)
         if outputs is None:

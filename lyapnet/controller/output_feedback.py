@@ -10,6 +10,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import State
 from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
+from lyapnet.task.input_disturbances import DisturbedSystem
 from lyapnet.task.outputs import Outputs
 from lyapnet.task.problem import Problem
 from lyapnet.value.law_after_horizon import ContinuedPolicy
@@ -20,12 +21,13 @@ class OutputFeedback:
 
     The first call is at t = 0: its readings correct the first estimate before the first control. Each further call
     predicts one step under the control of the call before, and corrects by its readings. Each loop of a batch, of the
-    shape of the first readings, has an estimate of its own; computations are in float64.
+    shape of the first readings, has an estimate of its own; computations are in float64. Disturbances d of controls
+    that are estimated too are taken off: the control is u(t, x̂) − d̂, within its limits.
 
     Args:
         law: u(t, x) with its V, for all t ≥ 0.
         problem: the steps that the estimator predicts with. Its states are those of the law, or (x, p) with parameters
-            p that are estimated too.
+            p that are estimated too; disturbances d of controls come last.
         outputs: h and the noise of the readings.
         kind: ekf, the extended Kalman filter; or ukf, the unscented one.
         drift: see KalmanFilter.
@@ -49,6 +51,11 @@ class OutputFeedback:
         self.deviation, self.around_state = deviation, around_state
         self._state_of_law = problem.initial_states.lower[: law.system.n]  # its precision, device and length
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
+        system = problem.system
+        self._controls, self._disturbed = (
+            problem.controls,
+            system.disturbed if isinstance(system, DisturbedSystem) else [],
+        )
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 
@@ -101,6 +108,15 @@ class OutputFeedback:
         return _in_form_of(self._like, self._belief.x)
 
     @property
+    def d_hat(self) -> Any:
+        """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 where none is estimated."""
+        return _in_form_of(self._like, self._d_hat)
+
+    @property
+    def _d_hat(self) -> Tensor:
+        return self._belief.x[..., self.problem.system.n - len(self._disturbed) :]
+
+    @property
     def P(self) -> Any:
         """The covariance of x̂ (*batch, n, n) after the last readings."""
         return _in_form_of(self._like, self._belief.P)
@@ -119,6 +135,8 @@ class OutputFeedback:
         self.observe(y, applied)
         like = self._state_of_law
         u = self.law(like.new_tensor(self._t), self._belief.x[..., : len(like)].to(like)).detach()
+        if self._disturbed:
+            u = self._controls.project(u.index_add(-1, torch.tensor(self._disturbed), self._d_hat.to(u), alpha=-1))
         self._u = u.double().cpu()
         return _in_form_of(y, u)
 

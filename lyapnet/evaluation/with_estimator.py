@@ -22,7 +22,7 @@ class EstimatedLoops(NamedTuple):
     """Closed loops with an estimator, and those from the same states, under the same noise, with the state known."""
 
     t: Times
-    x: StatePath  # the states; with random plants (x, p)
+    x: StatePath  # the states; with random plants (x, p), disturbances of controls last
     y: Tensor  # the readings (N + 1, b, p)
     x_hat: StatePath  # the estimates after the readings
     P: Float[Tensor, "nodes *batch n n"]
@@ -69,9 +69,11 @@ def loops_with_estimator(controller: Controller, estimator: OutputFeedback, x0: 
         seed: seed of the readings' noise, of the noise of the task and of random plants.
     """
     problem, outputs, plants = estimator.problem, estimator.outputs, controller.plants
+    draws = stream(seed, TEST, OUTPUTS)
     z0 = _on_plants(plants, x0, seed).double().cpu()
-    horizon, draws = problem.horizon, stream(seed, TEST, OUTPUTS)
-    increments = None
+    if further := problem.system.n - z0.shape[-1]:  # disturbances of controls
+        z0 = torch.cat([z0, problem.initial_states.sample(len(z0), draws)[:, -further:]], -1)
+    horizon, increments = problem.horizon, None
     if problem.noise is not None:
         increments = problem.noise.draw(horizon.steps, horizon.dt, z0, stream(seed, TEST, NOISE))
     times, like = horizon.times(z0), x0

@@ -174,6 +174,11 @@ class OutputsConfig:
         {}, "Random walk that an estimator assumes, each as STATE: σ in its unit per √s; see the page on outputs.",
         at_least=0,
     )  # fmt: skip
+    input_disturbances: dict[str, float] = setting(
+        {}, "Constant disturbances of controls, which an estimator finds and the law takes off, each as CONTROL: σ of "
+        "its drift, in its unit per √s.",
+        above=0,
+    )  # fmt: skip
     initial_deviation: list[float] | None = setting(
         None, "Standard deviation of the first estimate of each state; null: that of a uniform x₀ in X₀.", above=0
     )

@@ -11,7 +11,7 @@ from lyapnet.base.contracts import SLOPE, jumps
 from lyapnet.base.random_streams import OUTPUTS as OUTPUTS_STREAM
 from lyapnet.base.random_streams import START, stream
 from lyapnet.experiment.assembly.classes import float64_defaults
-from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of
+from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of, problem_of_estimator
 from lyapnet.experiment.config import OutputsConfig
 from lyapnet.loop.estimation.kalman import ExtendedKalmanFilter
 from lyapnet.loop.estimation.observability import observability
@@ -107,13 +107,13 @@ def facts_of(
 
 def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[Fact]:
     """Whether the outputs of a config tell the state along closed loops of the start; none without outputs."""
-    problem = in_float64(learner.problem)
-    if config is None or (outputs := build_outputs(config, problem)) is None:
+    if config is None or (outputs := build_outputs(config, in_float64(learner.problem))) is None:
         return []
+    problem = problem_of_estimator(config, in_float64(learner.problem))
     x0 = problem.initial_states.sample(OBSERVED_LOOPS, stream(0, START, OUTPUTS_STREAM))
     law, like = learner.rollout.closed_loop.policy, learner.problem.initial_states.lower
     times = problem.horizon.times(like)
-    path = path_under(problem, lambda n, x: law(times[n], x.to(like)).to(x), x0)
+    path = path_under(problem, lambda n, x: law(times[n], x[..., : len(like)].to(like)).to(x), x0)
     rows = path.cost.isfinite()
     if not rows.any():
         return [Fact(OBSERVABLE, "unknown: no closed loop of the start is finite")]

@@ -1,5 +1,7 @@
 """Builds the outputs of a config."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -8,10 +10,11 @@ from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import index_of, repeated, require_length
 from lyapnet.experiment.config import OutputsConfig
 from lyapnet.loop.estimation.kalman import initial_deviation, least_drift
+from lyapnet.task.input_disturbances import with_input_disturbances
 from lyapnet.task.outputs import MeasuredStates, Outputs, SystemOutput
 from lyapnet.task.problem import TRIED, Problem
 
-ASSUMED = "outputs.process_noise"
+ASSUMED, DISTURBANCES = "outputs.process_noise", "outputs.input_disturbances"
 
 
 def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
@@ -21,7 +24,7 @@ def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
         UsageError: a name, a length or a number does not fit, or h breaks its contract.
     """
     if config.noise is None:
-        if config.measure or config.process_noise or config.initial_deviation is not None:
+        if config.measure or config.process_noise or config.input_disturbances or config.initial_deviation is not None:
             raise UsageError(
                 "Expected outputs.noise, the standard deviation of each reading, got none; give one for each."
             )
@@ -44,20 +47,44 @@ def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
         return SystemOutput(system, config.noise, x)
 
 
-def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
-    """The random walk (n,) that an estimator assumes of each state besides the noise of the problem.
+def problem_of_estimator(config: OutputsConfig, problem: Problem) -> Problem:
+    """The problem whose states are estimated: (x, d) where the config names disturbances d of controls.
 
-    Where neither a walk is given nor the problem has noise, it is `least_drift`.
+    At first they have the standard deviation σ√T, which is how far they drift in the horizon.
+
+    Raises:
+        UsageError: a name is no control.
+    """
+    if not config.input_disturbances:
+        return problem
+    names = list(problem.system.control_names)
+    for name in config.input_disturbances:
+        if name not in names:
+            raise UsageError(
+                f"Expected {DISTURBANCES} among {', '.join(names)}, got {name!r}; name controls of the system."
+            )
+    controls = [names.index(name) for name in config.input_disturbances]
+    root = math.sqrt(problem.horizon.duration)
+    return with_input_disturbances(problem, controls, [root * drift for drift in config.input_disturbances.values()])
+
+
+def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
+    """The random walk (n,) that an estimator assumes of each of its states besides the noise of the problem.
+
+    Where neither a walk of x is given nor the problem has noise, it is `least_drift`.
+
+    Args:
+        problem: that of the estimator.
 
     Raises:
         UsageError: a name is no state.
     """
-    if not config.process_noise:
-        least = least_drift(problem)
-        return least if problem.noise is None else torch.zeros_like(least)
-    drift = torch.zeros_like(problem.initial_states.lower)
+    least = least_drift(problem)
+    drift = torch.zeros_like(least) if config.process_noise or problem.noise is not None else least
     for name, strength in config.process_noise.items():
         drift[index_of(name, ASSUMED, problem.system)] = strength
+    if config.input_disturbances:
+        drift[-len(config.input_disturbances) :] = drift.new_tensor([*config.input_disturbances.values()])
     return drift
 
 
@@ -82,6 +109,12 @@ def check_outputs(config: OutputsConfig, problem: Problem) -> None:
     Raises:
         UsageError: as the functions above.
     """
-    if build_outputs(config, problem) is not None:
+    if (outputs := build_outputs(config, problem)) is not None:
+        problem = problem_of_estimator(config, problem)
         drift_of(config, problem)
         deviation_of(config, problem)
+        if len(config.input_disturbances) > outputs.count:
+            raise UsageError(
+                f"Expected at most as many {DISTURBANCES} as readings, {outputs.count}, got "
+                f"{len(config.input_disturbances)}; leave some out: readings cannot tell more."
+            )

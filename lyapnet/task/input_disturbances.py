@@ -108,7 +108,7 @@ def with_input_disturbances(problem: Problem, controls: Sequence[int], deviation
     """
     n, box, k = problem.system.n, problem.initial_states, len(controls)
     reach = 3**0.5 * box.lower.new_tensor([*deviations])
-    initial_states = Box(torch.cat([box.lower, -reach]), torch.cat([box.upper, reach]))
+    initial_states = Box(torch.cat([box.lower, -reach]), torch.cat([box.upper, reach])).to(reach)
     cost = FamilyCost(problem.cost, box.lower.new_zeros(n, k), box.lower.new_zeros(k))
     h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
     own = problem.noise

@@ -112,8 +112,14 @@ def _estimator(
 ) -> "OutputFeedback | None":
     """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
     if not outputs:
-        known = controller.measures_outputs
-        return controller.with_estimator(kind, initial_deviation=deviation or None) if known else None
+        if controller.measures_outputs:
+            return controller.with_estimator(kind, initial_deviation=deviation or None)
+        if kind != "ekf" or deviation:
+            raise UsageError(
+                "Expected --outputs, or outputs in the run's YAML, with --estimator and --initial-deviation, got none; "
+                "name what is measured: --outputs STATE=SIGMA."
+            )
+        return None
     named = [text.rpartition("=") for text in outputs]
     try:
         noise = [float(value) for _, _, value in named]

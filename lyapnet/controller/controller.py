@@ -301,7 +301,7 @@ class Controller:
             UsageError: there are no outputs, or they do not fit the system.
         """
         given = {
-            "measure": None if measure is None else [*measure],
+            "measure": [measure] if isinstance(measure, str) else None if measure is None else [*measure],
             "noise": _listed(noise),
             "process_noise": None if process_noise is None else dict(process_noise),
             "input_disturbances": None if input_disturbances is None else dict(input_disturbances),

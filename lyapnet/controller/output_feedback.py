@@ -1,5 +1,6 @@
 """A controller that reads noisy outputs instead of the state: an estimator, and the law at its estimate."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ class OutputFeedback:
                 distribution on X₀.
 
         Raises:
-            ValueError: a shape does not fit, or P is not symmetric positive semidefinite.
+            ValueError: a shape does not fit, a number is not finite, or P is not symmetric positive semidefinite.
         """
         n = self.problem.system.n
         first = self.problem.initial_states.center if x_hat is None else _float64(x_hat)
@@ -83,14 +84,21 @@ class OutputFeedback:
                 f"Expected P of shape (*batch, {n}, {n}), symmetric and positive semidefinite, got another matrix of "
                 f"shape {tuple(covariance.shape)}; give a covariance."
             )
+        if not (bool(first.isfinite().all()) and math.isfinite(t)):
+            raise ValueError(f"Expected finite x_hat and t, got {first.tolist()} and {t}; give numbers.")
         self._belief, self._u, self._t = Belief(first, covariance), None, float(t)
         self._like: Any = x_hat if x_hat is not None else np.empty(0)
 
-    def draw_first(self, x0: State, generator: torch.Generator) -> State | None:
-        """A first estimate of each x₀, normal around it; None if none was given, and the centre of X₀ stands for it."""
-        if not self.around_state:
-            return None
-        return x0 + self.deviation * torch.randn(x0.shape, generator=generator, dtype=torch.float64)
+    def draw_first(self, x0: State, generator: torch.Generator) -> State:
+        """A first estimate for each x₀: the centre of X₀, or around x₀ in states that X₀ fixes.
+
+        With a deviation given it is around x₀ in all states. Of parameters and disturbances it is always the centre.
+        """
+        box, constants = self.problem.initial_states, list(self.problem.system.constants)
+        around = (box.widths == 0) | self.around_state
+        around[constants] = False
+        near = x0 + self.deviation * torch.randn(x0.shape, generator=generator, dtype=torch.float64)
+        return torch.where(around, near, box.center)
 
     @property
     def belief(self) -> Belief:
@@ -127,7 +135,8 @@ class OutputFeedback:
 
         Args:
             y: the readings; NaN for one that is missing.
-            applied: the control that the plant received since the last call, if it was not the one returned.
+            applied: the control that the plant received since the last call, if it was not the one returned; of no
+                meaning in the first call.
 
         Raises:
             ValueError: the shapes do not fit, or a reading is infinite.
@@ -157,9 +166,30 @@ class OutputFeedback:
         if self._u is None:
             belief = self._first_of(tuple(readings.shape[:-1]))
         else:
-            u = self._u if applied is None else _float64(applied).expand(self._u.shape)
+            u = self._u if applied is None else self._applied(applied, self._u)
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
-        self._belief = self.filter.update(belief, readings)
+        self._belief = self._with_parameters_in_range(self.filter.update(belief, readings))
+
+    @staticmethod
+    def _applied(given: Any, own: Tensor) -> Tensor:
+        """The control that the plant received, in the shape of the control that was returned."""
+        u = _float64(given)
+        if u.shape != own.shape or not bool(u.isfinite().all()):
+            raise ValueError(
+                f"Expected applied as finite numbers of shape {tuple(own.shape)}, that of the control returned, got "
+                f"{u.tolist() if u.numel() < 7 else tuple(u.shape)}; leave it out if the plant received that one."
+            )
+        return u
+
+    def _with_parameters_in_range(self, belief: Belief) -> Belief:
+        """The belief with estimates of parameters p moved into their ranges, beyond which f and V may be undefined."""
+        system, box = self.problem.system, self.problem.initial_states
+        parameters = list(system.constants)[: len(system.constants) - len(self._disturbed)]
+        if not parameters:
+            return belief
+        x = belief.x.clone()
+        x[..., parameters] = x[..., parameters].clamp(box.lower[parameters], box.upper[parameters])
+        return belief._replace(x=x)
 
     def _first_of(self, batch: tuple[int, ...]) -> Belief:
         """The first estimate of each loop of a batch."""

@@ -135,13 +135,12 @@ def _estimator_rows(result: dict[str, Any]) -> dict[str, str]:
     return {
         f"with {found['estimator']} from {read}": f"{found['runs']} runs",
         "… cost J, mean: state known, estimated": f"{known}, {cost}",
-        "… their ratio, with its 95 % interval": "–"
-        if ratio is None or half_width is None
-        else f"{ratio:.4f} ± {half_width:.2g}",
+        "… their ratio, with its 95 % interval": "–" if ratio is None else f"{ratio:.4f}{_plus_minus(half_width)}",
         "… runs lost, which cost half more than with the state known": f"{found['lost_fraction']:.2%}",
         "… (x − x̂)ᵀP⁻¹(x − x̂)/n, mean: 1 if P is right": "not finite"
-        if None in nees
-        else f"{nees[0]:.3f} ± {nees[1]:.2g}",
+        if nees[0] is None
+        else f"{nees[0]:.3f}{_plus_minus(nees[1])}",
+        "… runs with an error at T that P allows one in a thousand": f"{found['outlier_fraction']:.2%}",
         f"… steps where its mean over runs is in the 95 % band, {low:.3f} to {high:.3f}": f"{found['nees_inside']:.0%}",
         **{
             f"… error of {name} at T, root mean square; √P": "not finite"
@@ -150,6 +149,10 @@ def _estimator_rows(result: dict[str, Any]) -> dict[str, str]:
             for name, error in found["errors"].items()
         },
     }
+
+
+def _plus_minus(half_width: float | None) -> str:
+    return "" if half_width is None else f" ± {half_width:.2g}"
 
 
 def _interval(mean: float | None, half_width: float | None) -> str:

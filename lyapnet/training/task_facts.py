@@ -131,7 +131,13 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     if not vague:
         return [Fact(OBSERVABLE, f"yes; {known}")]
     listed = ", ".join(vague)
-    return [Fact(OBSERVABLE, f"no: the outputs hardly tell {listed}; {known}", f"measure {listed}, or what they move")]
+    return [
+        Fact(
+            OBSERVABLE,
+            f"no: the outputs hardly tell {listed}; {known}",
+            f"measure {listed} too, or states that depend on them",
+        )
+    ]
 
 
 def _domain_facts(learner: Learner) -> Iterator[Fact]:

@@ -180,3 +180,26 @@ def test_a_law_of_single_precision_is_fed_by_a_filter_of_double_precision():
         u = feedback.step(torch.tensor([0.5]))
     assert (u.dtype, feedback.belief.P.dtype) == (torch.float32, torch.float64)
     assert 0 < feedback.belief.P[0, 0] < 1.1e-12
+
+
+@pytest.mark.parametrize(("applied", "told"), [([0.1, 0.2], "shape"), ([math.nan], "finite")])
+def test_an_applied_control_that_is_none_is_refused(applied, told):
+    feedback = controller_of().with_estimator()
+    feedback.step([0.1])
+    with pytest.raises(ValueError, match=f"applied as .*{told}"):
+        feedback.step([0.1], applied=applied)
+
+
+@pytest.mark.parametrize("wrong", [{"x_hat": [math.nan, 0.0]}, {"t": math.nan}])
+def test_a_reset_to_what_is_no_number_is_refused(wrong):
+    with pytest.raises(ValueError, match="finite x_hat and t"):
+        controller_of().with_estimator().reset(**wrong)
+
+
+def test_estimated_parameters_stay_in_their_ranges():
+    feedback = controller_of(randomise={"length": [0.5, 1.5]}, controls={}).with_estimator()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(15):
+        feedback.step(torch.randn(200, 1, generator=generator).double())
+    assert feedback.x_hat[:, 2].min() == 0.5
+    assert feedback.x_hat[:, 2].max() == 1.5

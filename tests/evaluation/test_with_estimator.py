@@ -191,6 +191,22 @@ def test_the_tanks_of_the_page_are_a_task_whose_levels_one_reading_tells():
 
 
 def test_the_loop_of_the_page_runs(capsys):
-    (loop,) = [block for block in blocks("python", ROOT / "docs" / "outputs.md") if "loop.step" in block]
+    loop, offset = [block for block in blocks("python", ROOT / "docs" / "outputs.md") if "loop.step" in block]
     exec(loop, {})
     assert capsys.readouterr().out.startswith("0.02")  # two steps of 0.01 s after the first readings
+    exec(offset.replace("pump", "torque"), {"controller": controller_of(), "y": [0.1]})
+    assert capsys.readouterr().out.startswith("[")
+
+
+def test_a_run_that_diverges_makes_no_estimator_consistent():
+    """Its error is the mean of all, and half of the interval: 1 is within, and one in 64 is too many."""
+    controller = controller_of()
+    estimator = controller.with_estimator()
+    loops = loops_with_estimator(controller, estimator, controller.initial_states.sample(64))
+    assert measure_with_estimator(loops, estimator).outlier_fraction <= 0.05
+    x_hat = loops.x_hat.clone()
+    x_hat[:, 0] += 100
+    found = measure_with_estimator(loops._replace(x_hat=x_hat), estimator)
+    assert abs(found.nees - 1) <= found.nees_half_width
+    assert found.outlier_fraction >= 1 / 64
+    assert not found.consistent

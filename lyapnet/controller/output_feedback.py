@@ -145,7 +145,8 @@ class OutputFeedback:
         like = self._state_of_law
         u = self.law(like.new_tensor(self._t), self._belief.x[..., : len(like)].to(like)).detach()
         if self._disturbed:
-            u = self._controls.project(u.index_add(-1, torch.tensor(self._disturbed), self._d_hat.to(u), alpha=-1))
+            disturbed = torch.tensor(self._disturbed, device=u.device)
+            u = self._controls.project(u.index_add(-1, disturbed, self._d_hat.to(u), alpha=-1))
         self._u = u.double().cpu()
         return _in_form_of(y, u)
 

@@ -3,6 +3,7 @@
 import csv
 import shutil
 import threading
+import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -101,7 +102,9 @@ def resumed(tmp_path_factory):
         run = lyapnet.train(CONFIG, [home, "training.iterations=6"])
         early = run.checkpoints / "early.ckpt"
         shutil.copy(run.last, early)
+        time.sleep(1)  # TensorBoard reads files in the order of their names, which have the second they were begun in
         lyapnet.train(CONFIG, [home, "training.iterations=8"], resume="last")
+        time.sleep(1)
         lyapnet.train(CONFIG, [home, "training.iterations=10"], resume=str(early))
     return run
 

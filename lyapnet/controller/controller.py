@@ -17,13 +17,7 @@ from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
 from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
-from lyapnet.experiment.assembly.outputs import (
-    build_outputs,
-    check_outputs,
-    deviation_of,
-    drift_of,
-    problem_of_estimator,
-)
+from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
 from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
 from lyapnet.experiment.schema import check_values
 from lyapnet.loop.programs import Program, ValueProgram
@@ -312,17 +306,13 @@ class Controller:
         check_values(section, "outputs.")
         plants = self.plants
         problem = self.problem if plants is None else plants.problem
-        check_outputs(section, copied(problem))
-        problem = problem_of_estimator(section, problem)
-        exact = copied(problem)
-        outputs = build_outputs(section, exact)
-        if outputs is None:
+        if (parts := estimator_parts(section, copied(problem))) is None:
             raise UsageError(
                 "Expected outputs for an estimator, got none; add outputs: {measure: […], noise: […]} to the YAML, or "
                 "give measure and noise."
             )
         return OutputFeedback(
-            self.law, problem, outputs, kind, drift_of(section, exact), deviation_of(section, exact),
+            self.law, problem_of_estimator(section, problem), parts.outputs, kind, parts.drift, parts.deviation,
             around_state=section.initial_deviation is not None,
         )  # fmt: skip
 

@@ -52,11 +52,8 @@ class OutputFeedback:
         self.deviation, self.around_state = deviation, around_state
         self._state_of_law = problem.initial_states.lower[: law.system.n]  # its precision, device and length
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
-        system = problem.system
-        self._controls, self._disturbed = (
-            problem.controls,
-            system.disturbed if isinstance(system, DisturbedSystem) else [],
-        )
+        self._controls = problem.controls
+        self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 

@@ -11,7 +11,7 @@ from lyapnet.base.random_streams import NOISE, OUTPUTS, PLANTS, TEST, stream
 from lyapnet.base.types import PerState, State, StatePath, Times
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.output_feedback import OutputFeedback
-from lyapnet.evaluation.intervals import CONFIDENCE
+from lyapnet.evaluation.intervals import CONFIDENCE, half_width_of_mean
 from lyapnet.evaluation.under_noise import LOST_EXCESS
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.loop.random_plants import RandomPlants
@@ -67,7 +67,7 @@ class EstimatorMeasures(NamedTuple):
 def loops_with_estimator(controller: Controller, estimator: OutputFeedback, x0: State, seed: int = 0) -> EstimatedLoops:
     """Closed loops from a batch of states, with the estimator and with the state known.
 
-    The first estimate is the centre of X₀; if `outputs.initial_deviation` is given it is normal around x₀.
+    First estimates are those of `OutputFeedback.draw_first`.
 
     Args:
         seed: seed of the readings' noise, of the noise of the task and of random plants.
@@ -122,7 +122,7 @@ def measure_with_estimator(loops: EstimatedLoops, estimator: OutputFeedback) -> 
         estimator.kind, runs,
         dict(zip(outputs.names, outputs.noise.tolist(), strict=True)),
         float(known.mean()), float(J.mean()), ratio, half_width, float(lost.double().mean()),
-        float(each.mean()), _half_width(each), (low, high), float(inside.double().mean()),
+        float(each.mean()), half_width_of_mean(each[:, None]), (low, high), float(inside.double().mean()),
         float((~(n * nees[-1] <= float(chi2.ppf(RARE, n)))).double().mean()),
         dict(zip(problem.system.state_labels, zip(rms.tolist(), deviation, strict=True), strict=True)),
     )  # fmt: skip
@@ -140,13 +140,4 @@ def _ratio_of_means(J: PerState, known: PerState) -> tuple[float | None, float |
     ratio = float(J.mean() / known.mean())
     if not math.isfinite(ratio):
         return None, None
-    return ratio, _half_width((J - ratio * known) / known.mean())
-
-
-def _half_width(samples: Tensor) -> float:
-    """The half-width of the 95 % interval of a mean, from independent samples."""
-    if len(samples) < 2 or not samples.isfinite().all():
-        return math.inf
-    from scipy.special import stdtrit
-
-    return float(stdtrit(len(samples) - 1, (1 + CONFIDENCE) / 2)) * float(samples.std()) / math.sqrt(len(samples))
+    return ratio, half_width_of_mean(((J - ratio * known) / known.mean())[:, None])

@@ -11,7 +11,7 @@ from lyapnet.base.contracts import SLOPE, jumps
 from lyapnet.base.random_streams import OUTPUTS as OUTPUTS_STREAM
 from lyapnet.base.random_streams import START, stream
 from lyapnet.experiment.assembly.classes import float64_defaults
-from lyapnet.experiment.assembly.outputs import build_outputs, deviation_of, drift_of, problem_of_estimator
+from lyapnet.experiment.assembly.outputs import estimator_parts
 from lyapnet.experiment.config import OutputsConfig
 from lyapnet.loop.estimation.kalman import ExtendedKalmanFilter
 from lyapnet.loop.estimation.observability import observability
@@ -107,9 +107,9 @@ def facts_of(
 
 def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[Fact]:
     """Whether the outputs of a config tell the state along closed loops of the start; none without outputs."""
-    if config is None or (outputs := build_outputs(config, in_float64(learner.problem))) is None:
+    if config is None or (parts := estimator_parts(config, in_float64(learner.problem))) is None:
         return []
-    problem = problem_of_estimator(config, in_float64(learner.problem))
+    problem, outputs, drift, deviation = parts
     x0 = problem.initial_states.sample(OBSERVED_LOOPS, stream(0, START, OUTPUTS_STREAM))
     law, like = learner.rollout.closed_loop.policy, learner.problem.initial_states.lower
     times = problem.horizon.times(like)
@@ -118,8 +118,8 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     if not rows.any():
         return [Fact(OBSERVABLE, "unknown: no closed loop of the start is finite")]
     x, u = path.x[:, rows], path.u[:, rows]
-    deviation, system = deviation_of(config, problem), problem.system
-    found = observability(ExtendedKalmanFilter(problem, outputs, drift_of(config, problem)), x, u, deviation)
+    system = problem.system
+    found = observability(ExtendedKalmanFilter(problem, outputs, drift), x, u, deviation)
     fixed = problem.initial_states.widths == 0  # their deviation is no more than a convention
     usual = torch.where(fixed, deviation.maximum(x.flatten(0, 1).std(0)), deviation)
     vague = [name for name, lost in zip(system.state_names, found.of_first > VAGUE * usual, strict=True) if lost]

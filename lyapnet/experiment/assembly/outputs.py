@@ -1,6 +1,7 @@
 """Builds the outputs of a config."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -103,18 +104,31 @@ def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
     return deviation
 
 
-def check_outputs(config: OutputsConfig, problem: Problem) -> None:
-    """Check the section before a training, which knows nothing of outputs.
+class EstimatorParts(NamedTuple):
+    """What an estimator is made of, in float64."""
+
+    problem: Problem  # whose states are estimated
+    outputs: Outputs  # of these states
+    drift: Tensor  # see drift_of
+    deviation: Tensor  # see deviation_of
+
+
+def estimator_parts(config: OutputsConfig, problem: Problem) -> EstimatorParts | None:
+    """The parts of an estimator for a problem in float64; None if the config has no outputs.
 
     Raises:
-        UsageError: as the functions above.
+        UsageError: as the functions above, or there are more disturbances than readings.
     """
-    if (outputs := build_outputs(config, problem)) is not None:
-        problem = problem_of_estimator(config, problem)
-        drift_of(config, problem)
-        deviation_of(config, problem)
-        if len(config.input_disturbances) > outputs.count:
-            raise UsageError(
-                f"Expected at most as many {DISTURBANCES} as readings, {outputs.count}, got "
-                f"{len(config.input_disturbances)}; leave some out: readings cannot tell more."
-            )
+    if (outputs := build_outputs(config, problem)) is None:
+        return None
+    estimated = problem_of_estimator(config, problem)
+    if isinstance(outputs, SystemOutput) and estimated is not problem:
+        outputs = build_outputs(config, estimated)  # output(x) of (x, d)
+        assert outputs is not None
+    parts = EstimatorParts(estimated, outputs, drift_of(config, estimated), deviation_of(config, estimated))
+    if len(config.input_disturbances) > outputs.count:
+        raise UsageError(
+            f"Expected at most as many {DISTURBANCES} as readings, {outputs.count}, got "
+            f"{len(config.input_disturbances)}; leave some out: readings cannot tell more."
+        )
+    return parts

@@ -19,7 +19,7 @@ from lyapnet.experiment.assembly.entries import index_of, repeated, require_leng
 from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
 from lyapnet.experiment.assembly.noise import build_noise, check_risk
-from lyapnet.experiment.assembly.outputs import check_outputs
+from lyapnet.experiment.assembly.outputs import estimator_parts
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
@@ -92,7 +92,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             _refuse_free_controls_of_own_cost(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
-        check_outputs(config.outputs, problem)
+        estimator_parts(config.outputs, problem)  # raises what is wrong before a training, which knows no outputs
         problem = in_domain(config.domain, problem)
         if problem.constraints is not None and config.constraints.margin is None and config.network.penalty:
             problem.constraints.margin = choose_margins(problem, problem.constraints)

@@ -13,9 +13,9 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.controller.controller import Controller
 from lyapnet.experiment.assembly.classes import float64_defaults, section
-from lyapnet.loop.random_plants import NominalLaw, problem_of_plants
+from lyapnet.loop.random_plants import NominalLaw
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.task.family import PREFIX, FamilySystem, check_members
+from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_constant_states
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
@@ -68,7 +68,7 @@ class Plants:
 
     def problem(self, problem: Problem) -> Problem:
         """The problem in z: the cost, the controls and the constraints of the nominal plant, and X₀ × P."""
-        return problem_of_plants(problem, self.system, self.around(problem.initial_states))
+        return with_constant_states(problem, self.system, self.around(problem.initial_states))
 
 
 def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> Plants:

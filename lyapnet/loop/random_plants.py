@@ -6,8 +6,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.loop.rollout import Rollout, Trajectory
-from lyapnet.task.constraints import OfFirstStates
-from lyapnet.task.family import FamilyCost, FamilySystem
+from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
@@ -68,20 +67,6 @@ class NominalLaw(ValuePolicy):
 def append_zeros(slope: Tensor, z: Tensor) -> Tensor:
     """The gradient in z = (x, p) of a function that is independent of p, from its gradient in x."""
     return torch.cat([slope, torch.zeros_like(z[..., slope.shape[-1] :])], -1)
-
-
-def problem_of_plants(problem: Problem, system: FamilySystem, initial_states: Box) -> Problem:
-    """The problem in z = (x, p): the cost, the controls and the constraints of the nominal plant, and X₀ × P.
-
-    Args:
-        problem: that of the nominal plant, in x.
-        system: all plants, as a family.
-        initial_states: X₀ × P.
-    """
-    n, center = problem.system.n, initial_states.center
-    cost = FamilyCost(problem.cost, center.new_zeros(n, len(center) - n), center[n:])
-    h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
-    return problem.replaced(system=system, cost=cost, initial_states=initial_states, constraints=h)
 
 
 class RandomPlants(nn.Module):

@@ -18,7 +18,10 @@ from lyapnet.base.errors import UsageError, one_line
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, PerState, State
 from lyapnet.graphs.tracing import trace
+from lyapnet.task.constraints import OfFirstStates
 from lyapnet.task.cost import Cost
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
 MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
@@ -156,6 +159,20 @@ class FamilyCost(Cost):
 
     def R(self, x: State) -> ControlMatrix:
         return self.cost.R(x[..., : len(self.shift)]) if self.R_of_member is None else self.R_of_member(x)
+
+
+def with_constant_states(problem: Problem, system: ControlAffineSystem, initial_states: Box) -> Problem:
+    """A problem in z = (x, p), with constants p that only its system knows; all else is that of x.
+
+    Args:
+        problem: that in x.
+        system: that of z.
+        initial_states: X₀ × P.
+    """
+    n, center = problem.system.n, initial_states.center
+    cost = FamilyCost(problem.cost, center.new_zeros(n, len(center) - n), center[n:])
+    h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
+    return problem.replaced(system=system, cost=cost, initial_states=initial_states, constraints=h)
 
 
 def _expand_parameter(x: State, name: str, value: Any) -> PerState:

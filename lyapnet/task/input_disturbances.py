@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, State
-from lyapnet.task.constraints import OfFirstStates
-from lyapnet.task.family import FamilyCost
+from lyapnet.task.family import with_constant_states
 from lyapnet.task.noise import Noise as NoiseOfTask
 from lyapnet.task.noise import SystemNoise
 from lyapnet.task.problem import Problem
@@ -109,9 +108,7 @@ def with_input_disturbances(problem: Problem, controls: Sequence[int], deviation
     n, box, k = problem.system.n, problem.initial_states, len(controls)
     reach = 3**0.5 * box.lower.new_tensor([*deviations])
     initial_states = Box(torch.cat([box.lower, -reach]), torch.cat([box.upper, reach])).to(reach)
-    cost = FamilyCost(problem.cost, box.lower.new_zeros(n, k), box.lower.new_zeros(k))
-    h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
-    own = problem.noise
-    noise = None if own is None or isinstance(own, SystemNoise) else NoiseOfFirstStates(own, n, k)
-    system = DisturbedSystem(problem.system, controls)
-    return Problem(system, cost, problem.controls, initial_states, problem.horizon, h, noise)
+    larger = with_constant_states(problem, DisturbedSystem(problem.system, controls), initial_states)
+    if problem.noise is not None and not isinstance(problem.noise, SystemNoise):
+        larger.noise = NoiseOfFirstStates(problem.noise, n, k)
+    return larger

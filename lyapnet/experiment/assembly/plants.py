@@ -6,8 +6,9 @@ from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import float64_defaults
 from lyapnet.experiment.assembly.family import checked_ranges, members_of
 from lyapnet.experiment.config import Config
-from lyapnet.loop.random_plants import RandomPlants, problem_of_plants
+from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.loop.rollout import Rollout
+from lyapnet.task.family import with_constant_states
 
 
 def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
@@ -29,7 +30,7 @@ def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
     with float64_defaults():  # as when the problem is built
         exact, units = copy.deepcopy(problem.system).double(), [""] * len(ranges)
         system, box = members_of(config, exact, ranges, units, problem.initial_states, "randomise")
-    return RandomPlants(problem_of_plants(problem, system.to(like), box.to(like)), rollout)
+    return RandomPlants(with_constant_states(problem, system.to(like), box.to(like)), rollout)
 
 
 def _require_support(config: Config) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
-from lyapnet.controller.output_feedback import OutputFeedback
+from lyapnet.controller.output_feedback import OutputFeedback, in_form_of
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
 from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
 from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
@@ -370,7 +370,7 @@ class Controller:
             elif steps is not None and steps > self.horizon.steps:
                 trajectory = self._prolong(trajectory, steps - self.horizon.steps)
         return (
-            trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_in_form_of(x0, field) for field in trajectory))
+            trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(in_form_of(x0, field) for field in trajectory))
         )
 
     @torch.no_grad()
@@ -435,7 +435,7 @@ class Controller:
     ) -> Any:
         time, state = self._inputs(t, self._append_parameters(x, parameters) if parameters else x)
         with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
-            return _in_form_of(x, function(time, state))
+            return in_form_of(x, function(time, state))
 
     def _inputs(self, t: Any, x: Any) -> tuple[Tensor, Tensor]:
         state = self._state(x)
@@ -489,7 +489,3 @@ def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
 def _listed(given: Sequence[float] | float | None) -> list[float] | None:
     """A number as a list of one."""
     return None if given is None else [float(each) for each in np.atleast_1d(np.asarray(given))]
-
-
-def _in_form_of(given: Any, result: Any) -> Any:
-    return result if isinstance(given, Tensor) else result.detach().cpu().numpy()

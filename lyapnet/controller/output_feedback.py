@@ -110,12 +110,12 @@ class OutputFeedback:
     @property
     def x_hat(self) -> Any:
         """x̂ (*batch, n) after the last readings."""
-        return _in_form_of(self._like, self._belief.x)
+        return in_form_of(self._like, self._belief.x)
 
     @property
     def d_hat(self) -> Any:
         """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 where none is estimated."""
-        return _in_form_of(self._like, self._d_hat)
+        return in_form_of(self._like, self._d_hat)
 
     @property
     def _d_hat(self) -> Tensor:
@@ -124,7 +124,7 @@ class OutputFeedback:
     @property
     def P(self) -> Any:
         """The covariance of x̂ (*batch, n, n) after the last readings."""
-        return _in_form_of(self._like, self._belief.P)
+        return in_form_of(self._like, self._belief.P)
 
     @torch.no_grad()
     def step(self, y: Any, applied: Any = None) -> Any:
@@ -145,7 +145,7 @@ class OutputFeedback:
             disturbed = torch.tensor(self._disturbed, device=u.device)
             u = self._controls.project(u.index_add(-1, disturbed, self._d_hat.to(u), alpha=-1))
         self._u = u.double().cpu()
-        return _in_form_of(y, u)
+        return in_form_of(y, u)
 
     @torch.no_grad()
     def observe(self, y: Any, applied: Any = None) -> None:
@@ -211,5 +211,6 @@ def _is_covariance(P: Tensor) -> bool:
     return symmetric and bool((torch.linalg.eigvalsh(P) >= -1e-9 * size[..., 0]).all())
 
 
-def _in_form_of(given: Any, result: Tensor) -> Any:
+def in_form_of(given: Any, result: Any) -> Any:
+    """A tensor as it is where a tensor was given, else as an array."""
     return result if isinstance(given, Tensor) else result.numpy(force=True)

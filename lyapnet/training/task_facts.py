@@ -122,11 +122,11 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     found = observability(ExtendedKalmanFilter(problem, outputs, drift), x, u, deviation)
     fixed = problem.initial_states.widths == 0  # their deviation is no more than a convention
     usual = torch.where(fixed, deviation.maximum(x.flatten(0, 1).std(0)), deviation)
-    vague = [name for name, lost in zip(system.state_names, found.of_first > VAGUE * usual, strict=True) if lost]
-    told = ", ".join(
-        f"{name} {left:.2g}" for name, left in zip(system.state_names, found.deviation.tolist(), strict=True)
-    )
-    condition = f"condition {found.condition:.2g}" if found.rank == system.n else f"rank {found.rank} of {system.n}"
+    estimated = [(i, name) for i, name in enumerate(system.state_names) if i not in system.settings]
+    vague = [name for i, name in estimated if found.of_first[i] > VAGUE * usual[i]]
+    told = ", ".join(f"{name} {float(found.deviation[i]):.2g}" for i, name in estimated)
+    count = len(estimated)
+    condition = f"condition {found.condition:.2g}" if found.rank == count else f"rank {found.rank} of {count}"
     known = f"standard deviations at T: {told}; {condition} of the Gramian along {x.shape[1]} loops of the start"
     if not vague:
         return [Fact(OBSERVABLE, f"yes; {known}")]

@@ -95,7 +95,7 @@ def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
     Raises:
         UsageError: the length does not fit.
     """
-    deviation, system = initial_deviation(problem.initial_states), problem.system
+    deviation, system = initial_deviation(problem), problem.system
     if config.initial_deviation is not None:
         moving = [name for i, name in enumerate(system.state_names) if i not in system.constants]
         given = repeated(config.initial_deviation, len(moving))

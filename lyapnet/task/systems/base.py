@@ -32,6 +32,7 @@ class ControlAffineSystem(nn.Module, ABC):
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
     constants: Sequence[int] = ()  # indices of constant states, the parameters of a family
+    settings: Sequence[int] = ()  # those of them that f and g do not read, such as targets: no reading tells them
 
     @abstractmethod
     def f(self, x: State) -> State:
@@ -114,7 +115,7 @@ class ControlAffineSystem(nn.Module, ABC):
                     f"Expected one unit for each of the {len(listed)} {name}.{names}, got {len(of_each)}; "
                     f"declare {units}."
                 )
-        for attribute in ("angles", "constants"):
+        for attribute in ("angles", "constants", "settings"):
             listed = getattr(self, attribute)
             if not all(isinstance(i, int) and 0 <= i < self.n for i in listed):
                 raise UsageError(f"Expected {name}.{attribute} as indices of states, got {listed!r}; count from 0.")

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, State
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -38,6 +40,9 @@ class ExtendedSystem(ControlAffineSystem):
     def rates(self, s: Tensor) -> Tensor:
         """ṡ."""
         return torch.zeros_like(s)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+        return self.system.draw(x[: self.system.n], u)
 
     def f(self, x: State) -> State:
         x, s = self.split(x)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.contracts import differences, state_of
 from lyapnet.base.errors import UsageError, one_line
-from lyapnet.base.interpolation import ChebyshevProducts
+from lyapnet.base.interpolation import Basis
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, PerState, State
 from lyapnet.graphs.tracing import trace
@@ -116,10 +116,10 @@ class LinearTargets(Targets):
 
 
 class InterpolatedTargets(Targets):
-    """x*(p) and u*(p) as polynomials through the operating points of some members.
+    """x*(p) and u*(p) as polynomials, or other functions, through the targets of some members.
 
     Args:
-        basis: polynomials of p.
+        basis: functions of p.
         points: (x*, u*) at the nodes of the basis, (nodes, n + m).
         center: (x*, u*) at p̄, (n + m,).
         n: number of states.
@@ -129,7 +129,7 @@ class InterpolatedTargets(Targets):
     coefficients: Float[Tensor, "nodes n_plus_m"]
     rest_at_center: Float[Tensor, " m"]
 
-    def __init__(self, basis: ChebyshevProducts, points: Tensor, center: Tensor, n: int, solved: Sequence[int]):
+    def __init__(self, basis: Basis, points: Tensor, center: Tensor, n: int, solved: Sequence[int] = ()):
         super().__init__()
         self.basis, self.n, self.solved = basis, n, list(solved)
         away = basis.coefficients(points - center)
@@ -150,6 +150,8 @@ class InterpolatedTargets(Targets):
 
 class FamilyCost(Cost):
     """The cost of each member: q and φ of x − (x*(p) − x*(p̄)), u counted from u*(p), and R(x) or R(x; p).
+
+    With a reference it is that at each time on it, p = (τ,).
 
     Args:
         cost: q, R, φ and u* at p̄, functions of x.

@@ -22,6 +22,7 @@ from lyapnet.task.horizon import TABLEAUX
 from lyapnet.task.noise import Noise
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
+from lyapnet.task.systems import moving_states
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
 from lyapnet.training.config_facts import OBSERVABLE, Fact, format_numbers
 from lyapnet.training.learner import Learner
@@ -270,7 +271,7 @@ def _mode_facts(problem: Problem, around: Linearisation) -> list[Fact]:
     """The eigenvalues of ẋ = Ax + Bu at the goal, and whether the pair (A, B) is controllable."""
     if around.missing is not None:
         return [Fact("modes", f"unknown: {around.missing.reason}", around.missing.remedy)]
-    moving = [i for i in range(problem.system.n) if i not in problem.system.constants]
+    moving = moving_states(problem.system)
     A, B, dt = around.A[moving][:, moving], around.g[moving], problem.horizon.dt
     extent = problem.initial_states.reach_from(problem.goal)[moving]
     values = torch.linalg.eigvals(A)

@@ -245,7 +245,7 @@ def test_what_a_member_is_asked_for_and_cannot_be(trained):
     with pytest.raises(ValueError, match=r"Expected x of shape \(\*batch, 2\), got \(4,\)"):
         controller.policy(0, [0.0, 0.0, 1.0, 1.0], mass=1, length=1)
     with pytest.raises(UsageError, match=r"Expected mass as one number, got \[1, 1\]"):
-        member(controller.config, Parts(), controller.system, {"mass": [1, 1], "length": 1})
+        member(controller.config, Parts(), controller.problem, {"mass": [1, 1], "length": 1})
 
 
 @pytest.mark.gate

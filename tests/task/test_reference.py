@@ -207,7 +207,7 @@ def test_files_of_points_that_are_none(tmp_path, text, reason):
 def test_a_file_that_is_not_there_or_one_besides_points(tmp_path):
     path = write(tmp_path, "t,position\n0,0\n1,1\n2,0\n")
     (tmp_path / "r.csv").unlink()
-    with pytest.raises(UsageError, match="Expected a CSV file, got .*r.csv"):
+    with pytest.raises(UsageError, match=r"Expected a CSV file, got .*r.csv"):
         load_config(path)
     with pytest.raises(UsageError, match=r"reference.file or reference.points, got both"):
         load_config(path, ["reference.points={t: [0, 1, 2]}"])

@@ -16,7 +16,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
 from lyapnet.controller.output_feedback import OutputFeedback, in_form_of
-from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
+from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member, named, ranges_of
 from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
 from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
 from lyapnet.experiment.schema import check_values
@@ -452,11 +452,13 @@ class Controller:
         if not isinstance(self.system, FamilySystem):
             raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
         box, n = self.initial_states, self.system.system.n
-        state = self.system.joined(torch.as_tensor(x, dtype=box.lower.dtype, device=box.lower.device), parameters)
+        given = named(parameters, self.system.system)
+        state = self.system.joined(torch.as_tensor(x, dtype=box.lower.dtype, device=box.lower.device), given)
         lower, upper = box.lower[n:], box.upper[n:]
         room = 1e-9 * torch.maximum(lower.abs(), upper.abs())
         if not self._warned and not bool(Box(lower - room, upper + room).contains(state[..., n:]).all()):
-            self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in self.config.family.items())
+            ranges = ranges_of(self.config, self.system)
+            self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in ranges.items())
             note = "note: V was told %s, and is asked outside of that; what it says there is extrapolated."
             logging.getLogger(__name__).warning(note, known)
         return state

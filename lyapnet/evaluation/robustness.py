@@ -1,6 +1,7 @@
 """The cost of a controller under disturbances: other initial states, another plant, noise, delay, smaller steps."""
 
 import inspect
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from lyapnet.base.types import Control, State, Time
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
-from lyapnet.experiment.assembly import knows, with_parameters
+from lyapnet.experiment.assembly import knows, ranges_of, with_parameters
 from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
@@ -128,6 +129,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
     task in which V is told its value.
     """
     family = dict[str, float]() if not controller.system.constants else nominal(controller)
+    ranges = ranges_of(controller.config, controller.system) if isinstance(controller.system, FamilySystem) else {}
     whole, controller = controller, controller.with_(**family) if family else controller
     X0 = controller.initial_states
     x0 = X0.sample(samples, stream(seed, TEST))
@@ -142,7 +144,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
             yield undisturbed._replace(
                 name=f"{name.replace('_', ' ')} {share:+.0%}", problem=problem.replaced(system=system)
             )
-            if name in family and knows(whole.config, name, value * (1 + share)):
+            if name in family and knows(ranges[name], value * (1 + share)):
                 told = whole.with_(**{**family, name: value * (1 + share)})
                 policy = told.closed_loop.policy
                 named = f"{name.replace('_', ' ')} {share:+.0%}, told"
@@ -163,11 +165,16 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
 
 def nominal(family: Controller) -> dict[str, float]:
-    """The nominal member of a family: the parameters of the config, else the middle of each range."""
-    assert isinstance(family.system, FamilySystem)
-    own, middle = family.system.system, {name: sum(ends) / 2 for name, ends in family.config.family.items()}
-    given = {name: getattr(own, name, middle[name]) for name in middle}
-    return {name: value if knows(family.config, name, value) else middle[name] for name, value in given.items()}
+    """The nominal member of a family: the parameters of the config, else the middle of each range of p."""
+    system = family.system
+    assert isinstance(system, FamilySystem)
+    ranges = ranges_of(family.config, system)
+    middle = {
+        name: math.sqrt(least * greatest) if name in system.weights else (least + greatest) / 2
+        for name, (least, greatest) in ranges.items()
+    }
+    given = {name: getattr(system.system, name, middle[name]) for name in middle}
+    return {name: value if knows(ranges[name], value) else middle[name] for name, value in given.items()}
 
 
 def robustness(

@@ -1,12 +1,14 @@
 """Families of problems: the parameters in a range become constant states.
 
 With z = (x, p) and ṗ = 0, V(t, x, p) is an ordinary V(t, z): training, optima, evaluation and certificates treat the
-family as one problem with n + k states.
+family as one problem with n + k states. The entry of p for a weight w of the cost is log₁₀ w: weights are drawn evenly
+on a logarithmic scale, on which V is smooth over decades.
 """
 
 import copy
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,7 @@ from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, PerState, State
 from lyapnet.graphs.tracing import trace
 from lyapnet.task.constraints import OfFirstStates
-from lyapnet.task.cost import Cost
+from lyapnet.task.cost import Cost, DiagonalWeights, with_matrices
 from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
@@ -40,13 +42,18 @@ class FamilySystem(ExtendedSystem):
 
     Args:
         system: f and g.
-        names: names of p, (k,).
+        names: names of the parameters, (k,).
         units: units of p.
+        weights: those of the names that are weights of the cost; their entries of p are logarithms.
     """
 
-    def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
-        super().__init__(system, names, units)
-        self.parameters_in_f = {name: i for i, name in enumerate(names) if not name.startswith(PREFIX)}
+    def __init__(
+        self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str], weights: Collection[str] = ()
+    ):
+        super().__init__(system, [f"log10 {name}" if name in weights else name for name in names], units)
+        self.names, self.weights = tuple(names), frozenset(weights)
+        moving = [name for name in names if name not in weights and not name.startswith(PREFIX)]
+        self.parameters_in_f = {name: i for i, name in enumerate(names) if name in moving}
         own = range(system.n, system.n + len(names))
         self.constants = (*system.constants, *own)
         told = [i for i, name in zip(own, names, strict=True) if name not in self.parameters_in_f]
@@ -62,13 +69,22 @@ class FamilySystem(ExtendedSystem):
         Raises:
             ValueError: names or shapes do not match the family.
         """
-        names, n = [self.state_names[i] for i in self.constants], self.system.n
-        if parameters.keys() != set(names):
-            raise ValueError(f"Expected values for {', '.join(names)}, got {', '.join(parameters)}; give each.")
+        n = self.system.n
+        if parameters.keys() != set(self.names):
+            raise ValueError(f"Expected values for {', '.join(self.names)}, got {', '.join(parameters)}; give each.")
         if not x.ndim or x.shape[-1] != n:
             listed = ", ".join(self.system.state_names)
             raise ValueError(f"Expected x of shape (*batch, {n}), got {tuple(x.shape)}; the last axis holds {listed}.")
-        return torch.cat([x, torch.stack([_expand_parameter(x, name, parameters[name]) for name in names], -1)], -1)
+        entries = {name: _expand_parameter(x, name, parameters[name]) for name in self.names}
+        for name in self.weights:
+            if not bool((entries[name] > 0).all()):
+                raise ValueError(f"Expected {name} > 0, got {parameters[name]!r}; a weight of the cost is positive.")
+            entries[name] = entries[name].log10()
+        return torch.cat([x, torch.stack([*entries.values()], -1)], -1)
+
+    def values(self, p: Sequence[float]) -> dict[str, float]:
+        """The parameters by name, weights as such, from the entries of p."""
+        return {name: 10**each if name in self.weights else each for name, each in zip(self.names, p, strict=True)}
 
     def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
         """The system with parameters (k,), or with different ones for each of a batch of states."""
@@ -158,22 +174,44 @@ class FamilyCost(Cost):
         targets: x*(p) and u*(p).
         center: p̄ (k,).
         n: number of states x.
-        R: z ↦ (*batch, m, m), if it depends on p; None: R of the cost.
+        R: z ↦ (*batch, m, m), if it depends on p otherwise than by weights; None: R of the cost.
+        weights: the matrices of the cost as functions of its weights w; None: those of the cost.
+        logarithms: entries of p that are log₁₀ w, in the order of the weights.
     """
 
     def __init__(
-        self, cost: Cost, targets: Targets, center: Tensor, n: int, R: Callable[[State], ControlMatrix] | None = None
+        self,
+        cost: Cost,
+        targets: Targets,
+        center: Tensor,
+        n: int,
+        R: Callable[[State], ControlMatrix] | None = None,
+        weights: DiagonalWeights | None = None,
+        logarithms: Sequence[int] = (),
     ):
         super().__init__()
         self.cost, self.targets, self.n, self.R_of_member = cost, targets, n, R
+        self.weights, self.logarithms = weights, list(logarithms)
         self.goal = torch.cat([center.new_zeros(n) if cost.goal is None else cost.goal, center])
-        self.rest, self.R_constant, self.R_inverse = cost.rest, cost.R_constant, cost.R_inverse
+        self.rest = cost.rest
+        if weights is None or "R" not in weights.matrices:
+            self.R_constant, self.R_inverse = cost.R_constant, cost.R_inverse
 
-    def _centred(self, z: Tensor) -> Tensor:
-        return z[..., : self.n] - self.targets.shift(z[..., self.n :])
+    def member(self, p: Float[Tensor, "*batch k"]) -> Cost:
+        """The cost at p̄ with the weights of parameters (k,), or with different ones for each of a batch of states."""
+        if self.weights is None:
+            return self.cost
+        w = torch.stack([torch.exp(math.log(10) * p[..., i]) for i in self.logarithms], -1)
+        return with_matrices(self.cost, self.weights(w))
+
+    def _split(self, z: State) -> tuple[State, Tensor]:
+        """(x − (x*(p) − x*(p̄)), p)."""
+        x, p = z[..., : self.n], z[..., self.n :]
+        return x - self.targets.shift(p), p
 
     def from_goal(self, x: State) -> State:
-        return torch.cat([self.cost.from_goal(self._centred(x)), torch.zeros_like(x[..., self.n :])], -1)
+        x, p = self._split(x)
+        return torch.cat([self.cost.from_goal(x), torch.zeros_like(p)], -1)
 
     def target(self, p: Tensor) -> State:
         """x*(p), (*batch, n)."""
@@ -185,13 +223,17 @@ class FamilyCost(Cost):
         return self.cost.rest_at(x[..., : self.n]) if own is None else own
 
     def state(self, x: State) -> PerState:
-        return self.cost.state(self._centred(x))
+        x, p = self._split(x)
+        return self.member(p).state(x)
 
     def terminal(self, x: State) -> PerState:
-        return self.cost.terminal(self._centred(x))
+        x, p = self._split(x)
+        return self.member(p).terminal(x)
 
     def R(self, x: State) -> ControlMatrix:
-        return self.cost.R(x[..., : self.n]) if self.R_of_member is None else self.R_of_member(x)
+        if self.R_of_member is not None:
+            return self.R_of_member(x)
+        return self.member(x[..., self.n :]).R(x[..., : self.n])
 
 
 def family_cost_of(cost: Any) -> FamilyCost:

@@ -2,11 +2,12 @@
 
 from lyapnet.experiment.assembly.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
 from lyapnet.experiment.assembly.entries import entry_per_state
-from lyapnet.experiment.assembly.family import knows, member
+from lyapnet.experiment.assembly.family import knows, member, ranges_of
 from lyapnet.experiment.assembly.learner import build_program, build_rollout, build_value_function
 from lyapnet.experiment.assembly.named_parts import parts_named, parts_of
 from lyapnet.experiment.assembly.plants import build_plants
 from lyapnet.experiment.assembly.problem import build_problem, build_system, operating_point, with_parameters
+from lyapnet.experiment.assembly.weights import named
 
 __all__ = [
     "DTYPES",
@@ -22,10 +23,12 @@ __all__ = [
     "entry_per_state",
     "knows",
     "member",
+    "named",
     "operating_point",
     "own_parts",
     "parts_named",
     "parts_of",
+    "ranges_of",
     "resolve",
     "with_parameters",
 ]

@@ -12,6 +12,7 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.types import ControlMatrix, State
 from lyapnet.experiment.assembly.classes import Parts, section
 from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
+from lyapnet.experiment.assembly.weights import named, weighted_matrices, weights_among, weights_of, with_weights
 from lyapnet.experiment.config import Config
 from lyapnet.task.cost import Cost, MadeOfAnother, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
@@ -24,23 +25,37 @@ TEST_STATES = 8  # random (x, p) at which members are compared with newly constr
 
 
 def family_of(
-    config: Config, system: ControlAffineSystem, cost: Cost, controls: ControlSet, initial_states: Box
+    config: Config,
+    system: ControlAffineSystem,
+    cost: Cost,
+    controls: ControlSet,
+    initial_states: Box,
+    own_cost: bool = False,
 ) -> tuple[FamilySystem, FamilyCost, Box]:
     """The system, the cost and the box X₀ × P of a family in z = (x, p).
 
+    Args:
+        own_cost: whether the cost is an object of the user's instead of that of the config.
+
     Raises:
-        UsageError: a name is neither a parameter of the system nor target_STATE, a range is invalid, a member breaks
-            the contract of FamilySystem, or no control holds the target of a member.
+        UsageError: a name is neither a parameter of the system, nor target_STATE, nor a weight of the cost; a range is
+            invalid, a member breaks the contract of FamilySystem, or no control holds the target of a member.
     """
     if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
-    ranges = checked_ranges(config.family, "family")
+    weights = weights_among(config.family, system)
+    ranges = named(checked_ranges(config.family, "family"), system)
+    for name in weights:
+        if not ranges[name][0] > 0:
+            raise UsageError(f"Expected family.{name} > 0, got {ranges[name]}; V is a function of its logarithm.")
     of_states, moved = _target_indices(ranges, system), _moved_states(ranges, system)
     units = [system.state_units[of_states[name]] if name in of_states else "" for name in ranges]
-    family, box = members_of(config, system, ranges, units, initial_states)
-    center = box.center[system.n :]
+    family, box = members_of(config, system, ranges, units, initial_states, weights=weights)
+    least = [ranges[name][0] for name in weights]
+    matrices = weighted_matrices(config.cost, cost, weights, least, own_cost) if weights else None
     cost, targets = cost_and_targets(config, cost, family, controls, box, moved)
-    return family, FamilyCost(cost, targets, center, system.n, _weight_of_members(cost, family)), box
+    logarithms, R = [family.names.index(name) for name in weights], _weight_of_members(cost, family)
+    return family, FamilyCost(cost, targets, box.center[system.n :], system.n, R, matrices, logarithms), box
 
 
 def members_of(
@@ -50,15 +65,20 @@ def members_of(
     units: Sequence[str],
     initial_states: Box,
     key: str = "a family",
+    weights: Collection[str] = (),
 ) -> tuple[FamilySystem, Box]:
     """The family of a system with parameters in some ranges [least, greatest], and the box X₀ × P.
+
+    Args:
+        weights: names of the parameters that are weights of the cost.
 
     Raises:
         UsageError: a member breaks the contract of FamilySystem.
     """
-    low, high = (torch.tensor([r[side] for r in ranges.values()], dtype=torch.float64) for side in (0, 1))
-    family = FamilySystem(system, list(ranges), units)
-    box = Box(torch.cat([initial_states.lower.to(low), low]), torch.cat([initial_states.upper.to(high), high]))
+    family = FamilySystem(system, list(ranges), units, weights)
+    sides = (initial_states.lower, initial_states.upper)
+    ends = ({name: bounds[k] for name, bounds in ranges.items()} for k in (0, 1))
+    box = Box(*(family.joined(side.double(), end) for side, end in zip(sides, ends, strict=True)))
     _check_members(config, family, box, key)
     return family, box
 
@@ -74,29 +94,38 @@ def member(
     Raises:
         UsageError: a parameter is missing, unknown, no number, or outside the range that V was trained for.
     """
-    if parameters.keys() != config.family.keys():
-        names = ", ".join(parameters) or "none"
-        raise UsageError(f"Expected values for {', '.join(config.family)}, got {names}; give each.")
-    values = dict[str, float]()
-    for name, ends in config.family.items():
-        try:
-            values[name] = float(parameters[name])
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise UsageError(f"Expected {name} as one number, got {parameters[name]!r}; name one member.") from error
-        if not knows(config, name, values[name]):
-            raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
     family = problem.system
     assert isinstance(family, FamilySystem)
+    ranges, given = ranges_of(config, family), named(parameters, family.system)
+    if given.keys() != ranges.keys():
+        names = ", ".join(parameters) or "none"
+        raise UsageError(f"Expected values for {', '.join(ranges)}, got {names}; give each.")
+    values = dict[str, float]()
+    for name, ends in ranges.items():
+        try:
+            values[name] = float(given[name])
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UsageError(f"Expected {name} as one number, got {given[name]!r}; name one member.") from error
+        if not knows(ends, values[name]):
+            raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
     numbers = {name: values[name] for name in family.parameters_in_f}
     system = dataclasses.replace(config.system, parameters={**config.system.parameters, **numbers})
-    target = target_of_member(config, problem, _moved_states(values, family.system), [*values.values()])
-    own = dataclasses.replace(copy.deepcopy(config), system=system, target=target, family={})
-    return own, dataclasses.replace(parts, system=with_attributes(family.system, numbers)), [*values.values()]
+    weights = {weights_of(family.system)[name]: values[name] for name in family.weights}
+    cost = dataclasses.replace(config.cost, **with_weights(config.cost, weights, family.system))
+    p = [math.log10(value) if name in family.weights else value for name, value in values.items()]
+    target = target_of_member(config, problem, _moved_states(values, family.system), p)
+    own = dataclasses.replace(copy.deepcopy(config), system=system, cost=cost, target=target, family={})
+    return own, dataclasses.replace(parts, system=with_attributes(family.system, numbers)), p
 
 
-def knows(config: Config, name: str, value: float) -> bool:
+def ranges_of(config: Config, family: FamilySystem) -> dict[str, list[float]]:
+    """The range [least, greatest] of each parameter of a family, by its name in the family."""
+    return dict(zip(family.names, config.family.values(), strict=True))
+
+
+def knows(ends: Sequence[float], value: float) -> bool:
     """Whether a value is in the range of a family's parameter, up to rounding."""
-    least, greatest = config.family[name]
+    least, greatest = ends
     room = 1e-9 * max(abs(least), abs(greatest))
     return least - room <= value <= greatest + room
 

@@ -73,10 +73,12 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
-        if config.family and not config.reference.points:
-            system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
-        elif config.reference.points:
+        if config.reference.points:
             system, cost, initial_states = reference_of(config, system, cost, controls, initial_states)
+        elif config.family:
+            system, cost, initial_states = family_of(
+                config, system, cost, controls, initial_states, own_cost=parts.cost is not None
+            )
         elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
             cost = about_target(config, cost, system, controls, initial_states)
         if not isinstance(parts.cost, MadeOfAnother):

@@ -27,7 +27,7 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 
 TESTED = 8  # random members whose targets are checked, besides those at the ends of the ranges
-COUNTS = (2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter; the first is taken that is accurate
+COUNTS = (1, 2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter; the first is taken that is accurate
 MOST_MEMBERS = 400  # largest number of members whose targets are interpolated
 CHOOSE_ANOTHER = f"choose another, or {CONTROL_ADVICE}"
 ACCURATE = 1e-8  # largest rate at an interpolated target, in units of the rates on X₀
@@ -159,7 +159,7 @@ class TargetsOfMembers:
             x[i] = value
         found = search.nearest(x, self.solved) if self.solved else search.held_by(x)
         if found is None or not found.held:
-            values = ", ".join(f"{name} = {v:.6g}" for name, v in zip(self._names, p.tolist(), strict=True))
+            values = ", ".join(f"{name} = {value:.6g}" for name, value in self.family.values(p.tolist()).items())
             raise not_held_error(search.system, x, f"it is that of {values}: narrow the family, or {CONTROL_ADVICE}")
         return require_admitted(found)
 
@@ -175,7 +175,7 @@ class TargetsOfMembers:
         targets = self._through(basis) if len(nodes) <= MOST_MEMBERS else None
         if targets is None or not self._is_accurate(targets, tested):
             raise UsageError(
-                f"Expected targets that are smooth in {', '.join(self._names)}, got some that polynomials through "
+                f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials through "
                 f"{min(len(nodes), MOST_MEMBERS)} members miss; narrow the family, or write target_control."
             )
         return targets
@@ -213,10 +213,6 @@ class TargetsOfMembers:
     def _search(self, p: Tensor) -> OperatingPoints:
         limits = state_limits(self.config.constraints, self.family.system)
         return OperatingPoints(self.family.member(p), self.controls, self.initial_states, limits)
-
-    @property
-    def _names(self) -> list[str]:
-        return [self.family.state_names[i] for i in self.family.constants]
 
 
 def _state(entries: Mapping[int, float]) -> Tensor:

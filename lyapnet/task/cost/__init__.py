@@ -15,12 +15,15 @@ from lyapnet.task.cost.made_of_another import (
 from lyapnet.task.cost.penalty import PenaltyCost, closeness
 from lyapnet.task.cost.quadratic import QuadraticCost, is_quadratic
 from lyapnet.task.cost.smoothed import SmoothedCost
+from lyapnet.task.cost.weights import MATRICES, DiagonalWeights, with_matrices
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
 
 __all__ = [
     "COSTS",
+    "MATRICES",
     "Cost",
+    "DiagonalWeights",
     "MadeOfAnother",
     "ObstacleCost",
     "PenaltyCost",
@@ -37,4 +40,5 @@ __all__ = [
     "is_quadratic_about_target",
     "reason_for_no_goal",
     "spread",
+    "with_matrices",
 ]

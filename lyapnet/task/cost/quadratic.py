@@ -50,7 +50,7 @@ class QuadraticCost(Cost):
         if self.R_of_state is not None:
             return self.R_of_state(x)
         assert self.R_constant is not None
-        return self.R_constant.expand(*x.shape[:-1], *self.R_constant.shape)
+        return self.R_constant.expand(*x.shape[:-1], *self.R_constant.shape[-2:])
 
     def state(self, x: State) -> PerState:
         return quadratic_form(self.Q, x)

@@ -220,12 +220,19 @@ def _controls(controller: Controller, config: Config) -> dict[str, Any]:
     return dict(zip(("lower", "upper"), finite, strict=True))
 
 
+def _family_cost_words(system: ControlAffineSystem) -> list[str]:
+    """Descriptions of what differs between the costs of a family's members."""
+    assert isinstance(system, FamilySystem)
+    moving = ", ".join(name for name in system.names if name.startswith(PREFIX))
+    weights = ", ".join(name for name in system.names if name in system.weights)
+    return [*([f"x* moved by {moving}"] if moving else []), *([f"weights {weights} of the family"] if weights else [])]
+
+
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
     """The matrices of the cost in the config, or its class and parameters; and its target, in words."""
     cost, words = controller.cost, list[str]()
     while isinstance(cost, MadeOfAnother | FamilyCost):
-        moving = ", ".join(name for name in config.family if name.startswith(PREFIX))
-        words.append(cost.words if isinstance(cost, MadeOfAnother) else f"x* moved by {moving}" if moving else "")
+        words.extend([cost.words] if isinstance(cost, MadeOfAnother) else _family_cost_words(controller.system))
         cost = cost.cost
     about = {"with": "; ".join(filter(None, words))} if any(words) else {}
     if isinstance(cost, QuadraticCost):

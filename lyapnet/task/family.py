@@ -204,7 +204,7 @@ class FamilyCost(Cost):
         w = torch.stack([torch.exp(math.log(10) * p[..., i]) for i in self.logarithms], -1)
         return with_matrices(self.cost, self.weights(w))
 
-    def _split(self, z: State) -> tuple[State, Tensor]:
+    def _split(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """(x − (x*(p) − x*(p̄)), p)."""
         x, p = z[..., : self.n], z[..., self.n :]
         return x - self.targets.shift(p), p

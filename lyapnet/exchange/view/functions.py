@@ -10,10 +10,10 @@ from lyapnet.graphs.tracing import core_trace
 
 
 def functions_of(controller: Controller) -> str:
-    """The text of `look(t, x, u, V)`, `step(t, x, after, cost)` and `about(x, goal, end, worst)`.
+    """The text of `look(t, x, u, V)`, `step(t, x, after, cost, u, V)` and `about(x, goal, end, worst)`.
 
-    The first gives u(t, x) and V(t, x); the second the state after one step of the closed loop and what the step costs;
-    the third the goal (of each member of a family), φ(x) and max_j h_j(x), −∞ where there are no constraints.
+    The first gives u(t, x) and V(t, x); the second also the state after one step of the closed loop and what the step
+    costs; the third the goal (of each member of a family), φ(x) and max_j h_j(x), −∞ where there are no constraints.
 
     Raises:
         ExportError: a function of the controller cannot be traced, or an operation has no rule.
@@ -27,8 +27,9 @@ def functions_of(controller: Controller) -> str:
         return output.u[0], output.value[0]
 
     def step(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
-        after, _, cost, _, _ = one_step(t, dt, x[None])
-        return after[0], cost[0]
+        after, _, cost, u, V = one_step(t, dt, x[None])
+        assert V is not None
+        return after[0], cost[0], u[0], V[0]
 
     def about(x: Tensor) -> tuple[Tensor, ...]:
         goal = x[None] - problem.cost.from_goal(x[None])
@@ -39,7 +40,7 @@ def functions_of(controller: Controller) -> str:
     tables, texts = JavaScriptTables(), list[str]()
     for function, arguments, results in (
         (look, {"t": t, "x": x}, ["u", "V"]),
-        (step, {"t": t, "x": x}, ["after", "cost"]),
+        (step, {"t": t, "x": x}, ["after", "cost", "u", "V"]),
         (about, {"x": x}, ["goal", "end", "worst"]),
     ):
         graph = core_trace(function, list(arguments.values()), "f, g, a cost, constraints and V", ExportError)

@@ -1,4 +1,4 @@
-// The page of a controller. look(t, x, u, V), step(t, x, after, cost) and about(x, goal, end, worst) are its functions.
+// The page of a controller. look(t, x, u, V), step(t, x, after, cost, u, V) and about(x, goal, end, worst) are its functions.
 const facts = JSON.parse(document.getElementById("facts").textContent);
 const [BLUE, ORANGE, GREEN, VERMILION, GREY] = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"];
 const CYCLE = [BLUE, VERMILION, "#CC79A7", ORANGE, "#56B4E9", "#222222"];
@@ -16,9 +16,9 @@ function looked(t, x) {
   return { u, V: V[0] };
 }
 function stepped(t, x) {
-  const after = new Float64Array(n), cost = new Float64Array(1);
-  step([t], x, after, cost);
-  return { after, cost: cost[0] };
+  const after = new Float64Array(n), cost = new Float64Array(1), u = new Float64Array(m), V = new Float64Array(1);
+  step([t], x, after, cost, u, V);
+  return { after, cost: cost[0], u, V: V[0] };
 }
 function told(x) {
   const goal = new Float64Array(n), end = new Float64Array(1), worst = new Float64Array(1);
@@ -32,6 +32,9 @@ function limited(u) {
     return (upper !== null && u[k] >= upper - room) || (lower !== null && u[k] <= lower + room);
   });
 }
+// The parameters of a family, as indices of states, and one of them in the numbers of its range in the config.
+const parameters = [...facts.states.keys()].filter((i) => facts.states[i].parameter !== null);
+const asGiven = (i, value) => short(facts.states[i].logarithmic ? 10 ** value : value);
 const hasLimits = facts.controls.some(({ lower, upper }) => lower !== null || upper !== null);
 
 // Whether state k lies between its bounds in X0, and whether all do.
@@ -44,17 +47,15 @@ const inX0 = (x) => facts.states.every((_, k) => between(x, k));
 // The closed loop from x0 at t = 0, until T or until it leaves the finite numbers.
 function closedLoop(x0) {
   const loop = { x: [], u: [], V: [], paid: [0], worst: -Infinity, atLimit: 0, outside: !inX0(x0) };
-  loop.color = CYCLE[chosen.count % CYCLE.length];
   let x = Float64Array.from(x0);
   for (let k = 0; k <= facts.steps; k++) {
-    const { u, V } = looked(k * facts.dt, x);
+    const last = k === facts.steps, { u, V, after, cost } = last ? looked(T, x) : stepped(k * facts.dt, x);
     loop.x.push(x);
     loop.V.push(V);
-    loop.worst = Math.max(loop.worst, told(x).worst);
-    if (k === facts.steps) break;
+    if (facts.constraints.length) loop.worst = Math.max(loop.worst, told(x).worst);
+    if (last) break;
     loop.u.push(u);
     loop.atLimit += limited(u) / facts.steps;
-    const { after, cost } = stepped(k * facts.dt, x);
     if (!after.every(Number.isFinite)) break;
     loop.paid.push(loop.paid[k] + cost);
     x = after;
@@ -63,8 +64,12 @@ function closedLoop(x0) {
   loop.cost = whole ? loop.paid[facts.steps] + told(x).end : NaN;
   loop.toGo = loop.paid.map((paid) => loop.cost - paid);
   loop.t = loop.x.map((_, k) => k * facts.dt);
-  loop.name = `closed loop ${++chosen.count}${loop.outside ? ", from outside X₀" : ""}`;
   return loop;
+}
+// A closed loop with the name and colour that its number has.
+function numbered(loop, number) {
+  const name = `closed loop ${number}${loop.outside ? ", from outside X₀" : ""}`;
+  return { ...loop, number, name, color: CYCLE[(number - 1) % CYCLE.length] };
 }
 
 // The plane: the slice of the two axes through the other states.
@@ -89,7 +94,8 @@ const points = (() => {
   return Math.round(Math.min(81, Math.max(41, Math.sqrt((200 * 50) / spent(50)))));
 })();
 
-function grid() {
+// What the plane shows, one row after another: after each row it yields, so that a slider can be answered in between.
+function* rowsOfGrid() {
   const [across, up] = chosen.axes.map(axis).map(({ low, high }) =>
     Array.from({ length: points }, (_, k) => low + ((high - low) * k) / (points - 1)));
   const layers = { V: [], u: facts.controls.map(() => []), limited: [], worst: [], funnel: [] };
@@ -103,8 +109,16 @@ function grid() {
     if (hasLimits) layers.limited.push(row.map(({ u }) => +limited(u)));
     if (facts.constraints.length) layers.worst.push(row.map(({ x }) => told(x).worst));
     if (facts.funnel) layers.funnel.push(row.map(depth));
+    yield;
   }
   return { across, up, ...layers };
+}
+function grid() {
+  const rows = rowsOfGrid();
+  for (;;) {
+    const { done, value } = rows.next();
+    if (done) return value;
+  }
 }
 // rho + delta t - V(t, x) within the set D of the funnel; null outside of it.
 function depth({ t, x, V }) {
@@ -183,10 +197,11 @@ function marks() {
   return found;
 }
 const CONFIG = { displaylogo: false };
-function drawPlane() {
+function drawPlane(shown = grid()) {
+  drawing++; // what is drawn in the background is out of date
   const [across, up] = chosen.axes.map(axis), line = { color: "#ffffff", width: 2, dash: "dash" };
   const clock = { type: "line", x0: chosen.t, x1: chosen.t, yref: "paper", y0: 0, y1: 1, line };
-  Plotly.react("plane", [...layers(grid()), ...marks()], {
+  Plotly.react("plane", [...layers(shown), ...marks()], {
     height: 600, margin: { l: phone.matches ? 52 : 70, r: 10, t: 30, b: 110 }, hovermode: "closest", dragmode: "zoom",
     uirevision: chosen.axes.join(), shapes: chosen.axes.includes(TIME) ? [clock] : [],
     xaxis: { title: { text: across.label }, range: [across.low, across.high], zeroline: false },
@@ -195,9 +210,22 @@ function drawPlane() {
   }, CONFIG);
 }
 
+// The plane drawn between other events, unless another drawing of it begins.
+let drawing = 0;
+function drawPlaneInBackground() {
+  const own = ++drawing, rows = rowsOfGrid();
+  const proceed = () => {
+    if (own !== drawing) return;
+    const { done, value } = rows.next();
+    if (done) drawPlane(value);
+    else setTimeout(proceed);
+  };
+  proceed();
+}
+
 // Courses: states, controls with their limits, and V beside the cost to go, over time.
 const panels = [
-  ...facts.states.flatMap((s, i) => (s.parameter ? [] : [{ label: s.label, of: (loop) => loop.x.map((x) => x[i]) }])),
+  ...facts.states.flatMap((s, i) => (s.parameter !== null ? [] : [{ label: s.label, of: (loop) => loop.x.map((x) => x[i]) }])),
   ...facts.controls.map((c, k) => ({ label: c.label, of: (loop) => loop.u.map((u) => u[k]), limits: [c.lower, c.upper] })),
   { label: "cost", of: (loop) => loop.V, beside: (loop) => loop.toGo },
 ];
@@ -249,11 +277,12 @@ function warn(loop) {
     (held ? "only the proved funnel holds it." : "the training says nothing of it.");
 }
 function tell() {
-  const head = ["", "J(x₀)", "V(0, x₀)", "time at a limit", "constraints"];
-  const shown = head.map((_, c) => c < 3 || (c === 3 ? hasLimits : facts.constraints.length > 0));
+  const head = ["", "J(x₀)", "V(0, x₀)", "time at a limit", "constraints", ...parameters.map((i) => facts.states[i].parameter)];
+  const shown = head.map((_, c) => (c === 3 ? hasLimits : c === 4 ? facts.constraints.length > 0 : true));
   const lines = chosen.loops.map((loop) => [
     loop.name, Number.isFinite(loop.cost) ? short(loop.cost) : "diverges", short(loop.V[0]),
     `${(100 * loop.atLimit).toFixed(0)} %`, loop.worst > 0 ? "violated" : "kept",
+    ...parameters.map((i) => asGiven(i, loop.x[0][i])),
   ]);
   warn(chosen.loops.at(-1));
   element("loops").replaceChildren(...(lines.length ? [head, ...lines] : []).map((cells, r) => {
@@ -276,8 +305,16 @@ function onThin(value, k) {
 
 // What the user sets.
 function start(x0) {
-  chosen.loops = [...chosen.loops, closedLoop(x0)].slice(-CYCLE.length);
+  chosen.loops = [...chosen.loops, numbered(closedLoop(x0), ++chosen.count)].slice(-CYCLE.length);
   drawPlane();
+  drawCourses();
+  tell();
+}
+// The last closed loop anew from its start, with the parameters of the sliders; the first one if there is none.
+function follow() {
+  const last = chosen.loops.pop(), x0 = Float64Array.from(last?.x[0] ?? facts.first);
+  for (const i of parameters) x0[i] = chosen.x[i];
+  chosen.loops.push(numbered(closedLoop(x0), last?.number ?? ++chosen.count));
   drawCourses();
   tell();
 }
@@ -311,9 +348,44 @@ function offerAxes() {
   element("up").replaceChildren(...names.map((each) => option(...each)));
   [element("across").value, element("up").value] = chosen.axes;
 }
+// A function that acts once for all calls within some milliseconds, as a slider tells more often than plots can be drawn.
+function paced(milliseconds, act) {
+  let waiting = false;
+  return () => {
+    if (!waiting) setTimeout(() => { waiting = false; act(); }, milliseconds);
+    waiting = true;
+  };
+}
+// A slider for each parameter of a family: the response follows at once, and the plane when the slider rests.
+function offerParameters() {
+  const redraw = resting(150, drawPlaneInBackground), answer = paced(0, follow);
+  element("parameters").replaceChildren(...parameters.map((i) => {
+    const { parameter, low, high } = facts.states[i];
+    const label = document.createElement("label"), input = document.createElement("input"), shown = document.createElement("span");
+    Object.assign(input, { type: "range", min: low, max: high, step: "any", value: chosen.x[i], id: `parameter${i}` });
+    shown.textContent = asGiven(i, chosen.x[i]);
+    input.addEventListener("input", () => {
+      chosen.x[i] = input.valueAsNumber;
+      shown.textContent = asGiven(i, chosen.x[i]);
+      answer();
+      redraw();
+    });
+    label.append(`${parameter} `, input, " ", shown);
+    return label;
+  }));
+  element("follow").hidden = element("keep").hidden = !parameters.length;
+}
+// A function that acts once it has not been called for some milliseconds.
+function resting(milliseconds, act) {
+  let timer = 0;
+  return () => {
+    clearTimeout(timer);
+    timer = setTimeout(act, milliseconds);
+  };
+}
 function offerOthers() {
   const fields = facts.states.flatMap((state, i) => {
-    if (chosen.axes.includes(i)) return [];
+    if (chosen.axes.includes(i) || parameters.includes(i)) return [];
     const label = document.createElement("label"), input = document.createElement("input");
     Object.assign(input, { type: "number", step: "any", value: short(chosen.x[i]), id: `state${i}` });
     input.addEventListener("change", () => {
@@ -326,7 +398,7 @@ function offerOthers() {
   const back = document.createElement("button");
   back.textContent = `others at the ${facts.hasGoal ? "goal" : "centre of X₀"}`;
   back.addEventListener("click", () => {
-    chosen.x = facts.start.slice();
+    chosen.x = facts.start.map((value, i) => (parameters.includes(i) ? chosen.x[i] : value));
     offerOthers();
     drawPlane();
   });
@@ -369,17 +441,12 @@ if (facts.funnel) {
     `α = ${short(alpha)}, as the file of the proof records; lyapnet certify check bounds its leaves anew.`;
 }
 offerAxes();
+offerParameters();
 offerOthers();
 drawAnew();
 moveTo(0);
-let waiting = false; // a slider may tell more often than the plane can be drawn
-element("t").addEventListener("input", () => {
-  if (!waiting) setTimeout(() => {
-    waiting = false;
-    moveTo(Math.min(T, element("t").valueAsNumber * facts.dt));
-  }, 20);
-  waiting = true;
-});
+element("t").addEventListener("input", paced(20, () => moveTo(Math.min(T, element("t").valueAsNumber * facts.dt))));
+element("keep").addEventListener("click", () => { if (chosen.loops.length) start(chosen.loops.at(-1).x[0]); });
 element("across").addEventListener("change", (event) => choose(0, Number(event.target.value)));
 element("up").addEventListener("change", (event) => choose(1, Number(event.target.value)));
 element("layer").addEventListener("change", (event) => { chosen.layer = event.target.value; drawPlane(); });

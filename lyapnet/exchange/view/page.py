@@ -19,6 +19,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.figures import widest_axes
 from lyapnet.exchange.view.functions import functions_of
 from lyapnet.task.constraints import StateLimits, names_of, parts_of
+from lyapnet.task.family import FamilySystem
 from lyapnet.task.sets import Box
 
 LOOPS = 64  # closed loops from X₀ that say how far the axes go
@@ -80,12 +81,18 @@ def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None)
     limits = problem.controls.limits or (-torch.inf, torch.inf)
     sides = [torch.as_tensor(side).to(center).expand(system.m).tolist() for side in limits]
     extent = _extent(controller, funnel)
+    family = isinstance(system, FamilySystem)
+    parameters = dict(zip(system.constants, system.names, strict=True)) if family else {}
+    logarithmic = system.weights if family else frozenset[str]()
     facts = {
         "title": title,
         "task": f"{system.title}, {type(controller.program).__name__}, T = {problem.horizon.duration:g} s, "
         f"lyapnet {__version__}",
         "states": [
-            {"name": name, "label": label, "unit": unit, "low": low, "high": high, "parameter": i in system.constants}
+            {
+                "name": name, "label": label, "unit": unit, "low": low, "high": high,
+                "parameter": parameters.get(i), "logarithmic": parameters.get(i) in logarithmic,
+            }
             for i, (name, label, unit, low, high) in enumerate(
                 zip(
                     system.state_names, system.state_labels, system.state_units, extent.lower.tolist(),
@@ -98,6 +105,7 @@ def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None)
             for name, label, lower, upper in zip(system.control_names, system.control_labels, *sides, strict=True)
         ],
         "start": _start(controller).tolist(),
+        "first": _first(controller).tolist(),
         "hasGoal": problem.has_goal,
         "axes": _axes(controller),
         "initialStates": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
@@ -125,6 +133,12 @@ def _start(controller: Controller) -> State:
     """The other states of the first slice: those of the goal, of a family with its parameters at the centre of X₀."""
     problem, center = controller.problem, controller.initial_states.center
     return center - problem.cost.from_goal(center) if problem.has_goal else center
+
+
+def _first(controller: Controller) -> State:
+    """The start of a closed loop that nobody chose: between the centre of X₀ and its upper corner."""
+    box = controller.initial_states
+    return (box.center + box.upper) / 2
 
 
 def _extent(controller: Controller, funnel: KeptSide | None) -> Box:

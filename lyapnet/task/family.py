@@ -58,6 +58,7 @@ class FamilySystem(ExtendedSystem):
         self.constants = (*system.constants, *own)
         told = [i for i, name in zip(own, names, strict=True) if name not in self.parameters_in_f]
         self.settings = (*system.settings, *told)
+        self.logarithms = tuple(system.n + i for i, name in enumerate(names) if name in weights)
 
     @property
     def title(self) -> str:

@@ -22,6 +22,7 @@ from lyapnet.value.expansions import (
     greedy_law,
     in_float64,
     path_under,
+    riccati,
     sizes,
     without_penalty,
 )
@@ -68,11 +69,38 @@ def start_from(learner: Learner, expansion: Expansion, x0: State, level: float =
         return
     curvature = _positive_curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, deviations)
+    growth = _growth_with_weights(network, problem, expansion, kept)
     network.start_from_expansion(
-        *(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost)
+        *(part.to(network.scale) for part in parts),
+        growth=None if growth is None else growth.to(network.scale),
+        exact_end=is_quadratic_about_target(problem.cost),
     )
     if network.near_borders is not None:
         network.near_borders.fit(torch.cat([expansion.x, x0]))
+
+
+def _growth_with_weights(
+    network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept: list[int]
+) -> Tensor | None:
+    """A of `ExpansionNetwork`: how half the logarithm of each H_ii at the goal changes with each weight's logarithm.
+
+    None if V has no weights, if the expansion is not about the goal, or if weights come with targets.
+    """
+    H, weights = expansion.hessian, network.weights
+    if not weights or bool(expansion.value.any()) or bool(H[..., network.constants].any()):
+        return None
+    exact = in_float64(problem)
+    growth = H.new_zeros(*H.shape[:2], len(weights))
+    for k, weight in enumerate(weights):
+        i, ends = kept[weight], (exact.initial_states.lower, exact.initial_states.upper)
+        if not float(ends[1][i]) > float(ends[0][i]):
+            continue
+        goals = [exact.goal.index_fill(0, torch.tensor(i), float(end[i])) for end in ends]
+        low, high = (riccati(exact, goal).restricted_to(kept).hessian.diagonal(0, -2, -1) for goal in goals)
+        known = (low > 0) & (high > 0)
+        ratio = torch.where(known, high, 1.0) / torch.where(known, low, 1.0)
+        growth[..., k] = ratio.log() / 2 / (ends[1][i] - ends[0][i])
+    return growth
 
 
 def _deviations(problem: Problem, expansion: Expansion, x0: State) -> StatePath:

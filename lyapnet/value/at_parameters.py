@@ -36,3 +36,7 @@ class AtParameters(ValueFunction):
     def curvature(self, t: Time) -> Tensor | None:
         H, n = self.V.curvature(t), -len(self.p)
         return None if H is None else H[..., :n, :n]
+
+    def curvature_at(self, t: Time, x: State) -> Tensor | None:
+        H, n = self.V.curvature_at(t, self._append_parameters(x)), -len(self.p)
+        return None if H is None else H[..., :n, :n]

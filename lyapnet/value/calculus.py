@@ -37,6 +37,10 @@ class ValueFunction(nn.Module, ABC):
         """A positive semidefinite model of V_xx at t, (*batch, n, n), for control laws; None if V has none."""
         return None
 
+    def curvature_at(self, t: Time, x: State) -> Tensor | None:
+        """The same at a state, on which it depends in a family with weights of the cost."""
+        return self.curvature(t)
+
 
 def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
     """(V_t, V_x) by automatic differentiation, of shapes (*batch,) and (*batch, n)."""

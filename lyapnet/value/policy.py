@@ -151,7 +151,7 @@ class SampledPolicy(ValuePolicy):
 
     def forward(self, t: Time, x: State) -> Control:
         after, free = self._after(t), self.problem.response(x)
-        V_x, H = self.V.value_and_state_gradient(after, free.x)[1], self._curvature(after)
+        V_x, H = self.V.value_and_state_gradient(after, free.x)[1], self._curvature(after, free.x)
         if self.problem.risk and self.problem.noise is not None:
             sigma, dt = self.problem.noise(x), self.problem.horizon.dt
             V_x, H = equivalent_derivatives(V_x, H, sigma, dt, self.problem.risk)
@@ -161,9 +161,9 @@ class SampledPolicy(ValuePolicy):
         """t + Δt, at most T."""
         return (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
 
-    def _curvature(self, t: Time) -> Tensor:
+    def _curvature(self, t: Time, x: State) -> Tensor:
         """H, (*batch, n, n)."""
-        H = self.V.curvature(t) if self.riccati is None else self.riccati(t)
+        H = self.V.curvature_at(t, x) if self.riccati is None else self.riccati(t)
         assert H is not None
         return H
 
@@ -187,7 +187,7 @@ class LookaheadPolicy(SampledPolicy):
 
     def forward(self, t: Time, x: State) -> Control:
         step = _HeldStep(self.problem, self.V, self._after(t), x)
-        H = self._curvature(step.after)
+        H = self._curvature(step.after, x)
         with torch.no_grad():
             u = super().forward(t, x)
             for _ in range(DESCENTS if self.problem.constraints is None else STEEP):

@@ -12,6 +12,7 @@ from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import Program
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import Cost
+from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
@@ -55,6 +56,8 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
     accepted, domain = inspect.signature(cls).parameters, problem.domain
     if "constants" in accepted:
         chosen["constants"] = [kept.index(i) for i in problem.system.constants if i in kept]
+    if "weights" in accepted and isinstance(problem.system, FamilySystem):
+        chosen["weights"] = [kept.index(i) for i in problem.system.logarithms]
     if "borders" in accepted and domain is not None:
         places = {problem.system.state_names[i]: place for place, i in enumerate(kept)}
         chosen["borders"] = [(places[each.state], each) for each in domain.borders if each.state in places]

@@ -73,12 +73,15 @@ class Backward(NamedTuple):
         return Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.replaced[:, rows])
 
 
-def riccati(problem: Problem) -> Expansion:
+def riccati(problem: Problem, goal: State | None = None) -> Expansion:
     """The value function of the problem linearised at its goal x̄ = x*: F to first order; q, R and φ to second order.
 
     Control limits are ignored: they are not active near a goal that needs no control.
+
+    Args:
+        goal: (x*(p), p) of a member of a family; None: the goal of the problem.
     """
-    return _at_goal(problem).expansion
+    return _at_goal(problem, goal).expansion
 
 
 def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
@@ -90,10 +93,10 @@ def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
     return problem.rest.double().cpu() + backward.k, backward.K
 
 
-def _at_goal(problem: Problem) -> "Backward":
+def _at_goal(problem: Problem, goal: State | None = None) -> "Backward":
     """The backward pass at x*, without control limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
-    x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
+    x, u = (problem.goal if goal is None else goal).expand(N + 1, -1), problem.rest.expand(N, -1)
     return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False, noise=problem.noise)
 
 

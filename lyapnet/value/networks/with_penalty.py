@@ -51,6 +51,9 @@ class WithPenalty(ValueFunction):
     def curvature(self, t: Time) -> Tensor | None:
         return self.network.curvature(t)
 
+    def curvature_at(self, t: Time, x: State) -> Tensor | None:
+        return self.network.curvature_at(t, x)
+
     def _penalty(self, t: Time, x: State) -> PerState:
         return self.step * self.weight * closeness(self._constraints[0], self.margin, x)
 

@@ -21,6 +21,9 @@ from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, DoubleIntegrator
 from lyapnet.training import start
+from lyapnet.training.build_learner import build_learner
+from lyapnet.training.initial_networks import start_from
+from lyapnet.value.calculus import gradients
 from lyapnet.value.expansions import greedy_law, optimal_trajectories, path_under, riccati
 from lyapnet.value.policy import HJBPolicy
 from lyapnet.value.regulator import Regulator
@@ -159,6 +162,48 @@ def test_the_regulator_of_a_member_is_that_of_its_weights():
     own, alone = Regulator(family), Regulator(linear_member(1.7, 0.06))
     assert_close(own(joined(family, x, Q_position=1.7, R_force=0.06)), alone(x), rtol=1e-2, atol=0)
     assert not torch.allclose(own(joined(family, x, Q_position=1.7, R_force=0.1)), alone(x), rtol=1e-2, atol=0)
+
+
+def started(plain, **others):
+    """(family, V) with V on top of the Riccati solutions, N = 0."""
+    config = config_from_plain({**plain, **others})
+    task = build_problem(config)
+    learner = build_learner(config, task)
+    start_from(learner, riccati(task), task.initial_states.sample(64))
+    return task, learner.V
+
+
+@torch.no_grad()
+def test_v_starts_near_the_riccati_solution_of_every_member():
+    """Its growth with each weight is that of the Riccati solutions at the ends of the range."""
+    family, V = started(LINEAR, horizon={"steps": 60, "dt": 0.05})
+    z = family.initial_states.sample(4)
+    for x, p in zip(*family.system.split(z), strict=True):
+        member = linear_member(*family.system.values(p.tolist()).values(), horizon={"steps": 60, "dt": 0.05})
+        at_member, t = torch.cat([x, p]), torch.tensor(0.0)
+        expected = riccati(member)
+        assert_close(V(t, at_member), expected.initially(x), rtol=0.2, atol=0)
+        assert_close(V.curvature_at(t, at_member)[:2, :2], expected.hessian[0], rtol=0.25, atol=0.05)
+    mean = riccati(family)
+    assert not torch.allclose(torch.stack([mean.initially(each) for each in z]), V(torch.tensor(0.0), z), rtol=0.2)
+
+
+@pytest.mark.parametrize("plain", [LINEAR, {**PENDULUM, "family": {**ALL, "mass": [0.9, 1.1]}}], ids=["linear", "mixed"])
+def test_v_with_weights_has_the_gradient_of_autograd(plain):
+    family, V = started(plain)
+    torch.nn.init.normal_(V.network.output.weight)
+    family.check_value_function(V)
+    with torch.no_grad():
+        V.size_rates += 0.1  # which the gradient has to follow
+        V.expansion.values[:, -len(V.weights) * V.n :] += 0.1
+    family.check_value_function(V)
+    at_goals = family.initial_states.sample(3) * torch.cat([torch.zeros(2), torch.ones(V.n - 2)])
+    value, V_x = V.value_and_state_gradient(torch.tensor(0.3), at_goals)
+    assert_close(torch.cat([value, V_x[:, :2].flatten()]), torch.zeros(9), rtol=0, atol=1e-9)
+    own = V.value_and_state_gradient
+    V.value_and_state_gradient = lambda t, x: (own(t, x)[0], own(t, x)[1] * (1 + 0.01 * V.placed.sum(0)))
+    with pytest.raises(UsageError, match="as V and its gradient"):  # the entries of the weights count too
+        family.check_value_function(V)
 
 
 @pytest.mark.gate

@@ -38,7 +38,13 @@ class IgnoringStates(ValueFunction):
         return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)
 
     def curvature(self, t: Time) -> Tensor | None:
-        H = self.network.curvature(t)
+        return self._with_zeros(self.network.curvature(t))
+
+    def curvature_at(self, t: Time, x: State) -> Tensor | None:
+        return self._with_zeros(self.network.curvature_at(t, x[..., self.kept]))
+
+    def _with_zeros(self, H: Tensor | None) -> Tensor | None:
+        """H with zeros for the ignored states."""
         if H is None:
             return None
         places = torch.eye(self.n, dtype=H.dtype, device=H.device)[self.kept]

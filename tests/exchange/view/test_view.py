@@ -152,6 +152,41 @@ def test_a_click_beside_thin_initial_states_starts_in_them(tmp_path):
     assert title.split() == ["false,solid,false", "true,dash,true"]  # the cart's position is 0 in X₀
 
 
+def test_the_last_closed_loop_follows_the_sliders_of_the_parameters(tmp_path):
+    """From the same start, with the cost that the controller has there; a weight is shown as such."""
+    controller = controller_of("pendulum_weights", "network.hidden=[8]")
+    act = """const tells = () => { const { number, cost, x } = chosen.loops.at(-1); told.push([chosen.loops.length, number,
+        cost, ...x[0], element("parameter2").nextElementSibling.textContent, element("loops").innerText.includes("Q_angle"),
+      ].join()); };
+    const { lower } = facts.initialStates, to = lower[2] + 0.1;
+    await click(lower[0] + 0.2, lower[1] + 0.2); tells();
+    element("parameter2").value = to; tells();
+    element("parameter2").dispatchEvent(new Event("input")); await pause(500); tells();
+    element("keep").click(); element("parameter2").value = to + 0.2;
+    element("parameter2").dispatchEvent(new Event("input")); await pause(500); tells();
+    told.push(chosen.loops[0].x[0][2]);"""
+    title, check = shown(page_for("pendulum_weights", "network.hidden=[8]"), tmp_path, act)
+    *states, kept = title.split()
+    before, unheard, after, second = (state.split(",") for state in states)
+    assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9
+    assert before == unheard, "nothing happens before the slider says so"
+    assert (before[:2], after[:2], second[:2]) == (["1", "1"], ["1", "1"], ["2", "2"])
+    assert before[3:5] == after[3:5] == second[3:5], "the start stays"
+    assert float(after[7]) == pytest.approx(10 ** float(after[5]), rel=1e-3)
+    assert float(kept) == float(after[5]) == pytest.approx(float(second[5]) - 0.2)
+    for state in (before, after, second):
+        cost = controller.rollout(torch.tensor([float(each) for each in state[3:7]])).cost
+        assert float(state[2]) == pytest.approx(float(cost), rel=1e-6)
+    assert {state[8] for state in (before, after, second)} == {"true"}
+    assert len({state[2] for state in (before, after, second)}) == 3
+
+
+def test_sliders_are_for_families(tmp_path):
+    act = """told.push([element("parameters").children.length, element("follow").hidden, element("keep").hidden].join());"""
+    assert shown(page_for("double_integrator"), tmp_path, act)[0] == "0,true,true"
+    assert shown(page_for("cartpole_family", "network.hidden=[8]"), tmp_path, act)[0] == "2,false,false"
+
+
 @pytest.mark.parametrize(
     ("name", "overrides", "width"),
     [

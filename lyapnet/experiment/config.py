@@ -324,8 +324,9 @@ class Config:
         None, "u*, the control at rest; null: the control that holds x*, f(x*) + g(x*)u* = 0."
     )
     family: dict[str, list[float]] = setting(
-        {}, "Ranges of parameters in V: of the system, target_STATE, and weights of the cost as cost.Q.STATE; each as "
-        "[least, greatest]."
+        {},
+        "Ranges of parameters in V: of the system, target_STATE, and weights of the cost as cost.Q.STATE; each as "
+        "[least, greatest].",
     )
     reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     noise: dict[str, float] = setting(

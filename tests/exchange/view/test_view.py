@@ -155,9 +155,11 @@ def test_a_click_beside_thin_initial_states_starts_in_them(tmp_path):
 def test_the_last_closed_loop_follows_the_sliders_of_the_parameters(tmp_path):
     """From the same start, with the cost that the controller has there; a weight is shown as such."""
     controller = controller_of("pendulum_weights", "network.hidden=[8]")
-    act = """const tells = () => { const { number, cost, x } = chosen.loops.at(-1); told.push([chosen.loops.length, number,
-        cost, ...x[0], element("parameter2").nextElementSibling.textContent, element("loops").innerText.includes("Q_angle"),
-      ].join()); };
+    act = """const tells = () => {
+      const { number, cost, x } = chosen.loops.at(-1), weight = element("parameter2").nextElementSibling.textContent;
+      const named = element("loops").innerText.includes("Q_angle");
+      told.push([chosen.loops.length, number, cost, ...x[0], weight, named].join());
+    };
     const { lower } = facts.initialStates, to = lower[2] + 0.1;
     await click(lower[0] + 0.2, lower[1] + 0.2); tells();
     element("parameter2").value = to; tells();
@@ -182,7 +184,8 @@ def test_the_last_closed_loop_follows_the_sliders_of_the_parameters(tmp_path):
 
 
 def test_sliders_are_for_families(tmp_path):
-    act = """told.push([element("parameters").children.length, element("follow").hidden, element("keep").hidden].join());"""
+    act = """const hidden = ["follow", "keep"].map((id) => element(id).hidden);
+    told.push([element("parameters").children.length, ...hidden].join());"""
     assert shown(page_for("double_integrator"), tmp_path, act)[0] == "0,true,true"
     assert shown(page_for("cartpole_family", "network.hidden=[8]"), tmp_path, act)[0] == "2,false,false"
 

@@ -112,7 +112,15 @@ def test_the_regions_are_the_published_tasks(name):
 
 def test_every_shipped_config_is_a_task_of_the_sheet():
     alone = {"integrator_chain", "pendulum_limited", "pendulum_held", "pendulum_periodic", "obstacle"}
-    alone |= {"cartpole_family", "reacher_family", "pendulum_weights", "cartpole_weights", "bryson_denham", "keep_out", "pendulum_noise"}
+    alone |= {
+        "cartpole_family",
+        "reacher_family",
+        "pendulum_weights",
+        "cartpole_weights",
+        "bryson_denham",
+        "keep_out",
+        "pendulum_noise",
+    }
     alone |= {"pendulum_noise_certified", "van_der_pol_noise_certified", "pendulum_reach"}
     alone |= {
         "double_integrator_two_sided",

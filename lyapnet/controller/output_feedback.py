@@ -12,6 +12,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import State
 from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
+from lyapnet.task.family import LOGARITHM
 from lyapnet.task.input_disturbances import DisturbedSystem
 from lyapnet.task.outputs import Outputs
 from lyapnet.task.problem import Problem
@@ -57,7 +58,8 @@ class OutputFeedback:
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
         self._controls = problem.controls
         self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
-        self._settings = {problem.system.state_names[i]: i for i in problem.system.settings}
+        names = problem.system.state_names
+        self._settings = {names[i].removeprefix(LOGARITHM): i for i in problem.system.settings}
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 
@@ -187,14 +189,16 @@ class OutputFeedback:
                 known = ", ".join(self._settings) or "none"
                 raise ValueError(f"Expected settings among {known}, got {name!r}; correct the name, or leave it out.")
             i = self._settings[name]
-            low, high = float(box.lower[i]), float(box.upper[i])
-            number = _float64(value)
+            low, high, number = float(box.lower[i]), float(box.upper[i]), _float64(value)
+            weight = self.problem.system.state_names[i].startswith(LOGARITHM)
+            number = number.log10() if weight else number
             if number.ndim and number.shape != x.shape[:-1]:
                 raise ValueError(
                     f"Expected {name} as a number or of shape {tuple(x.shape[:-1])}, got {tuple(number.shape)}."
                 )
             room = ROUNDING * max(abs(low), abs(high))
             if not bool(((low - room <= number) & (number <= high + room)).all()):
+                low, high = (10**low, 10**high) if weight else (low, high)
                 raise ValueError(f"Expected {name} from {low:g} to {high:g}, for which V was trained, got {value}.")
             x[..., i] = number
         if self._u is not None and not torch.equal(x, self._belief.x):

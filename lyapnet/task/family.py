@@ -31,6 +31,7 @@ from lyapnet.task.systems import ControlAffineSystem
 
 MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
 ROUNDING = 1e-14  # coefficients of targets below this count as zero, relative to the largest state or control
+LOGARITHM = "log10 "  # begins the names of states that are logarithms of weights
 PREFIX = "target_"  # of parameters that move the target instead of the dynamics
 
 
@@ -50,7 +51,7 @@ class FamilySystem(ExtendedSystem):
     def __init__(
         self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str], weights: Collection[str] = ()
     ):
-        super().__init__(system, [f"log10 {name}" if name in weights else name for name in names], units)
+        super().__init__(system, [f"{LOGARITHM}{name}" if name in weights else name for name in names], units)
         self.names, self.weights = tuple(names), frozenset(weights)
         moving = [name for name in names if name not in weights and not name.startswith(PREFIX)]
         self.parameters_in_f = {name: i for i, name in enumerate(names) if name in moving}

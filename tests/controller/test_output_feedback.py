@@ -249,3 +249,15 @@ def test_settings_that_do_not_exist_are_refused(settings, reason):
         feedback.step([0.1], **settings)
     with pytest.raises(ValueError, match="settings among none"):
         controller_of().with_estimator().step([0.1], **settings)
+
+
+def test_a_weight_of_the_cost_is_told_as_it_is():
+    """Not its logarithm, which is what V knows."""
+    controller = controller_of(family={"cost.R.0": [0.01, 1]}, controls={"lower": -20, "upper": 20})
+    feedback = controller.with_estimator()
+    u = feedback.step([0.3], R_torque=0.02)
+    assert_close(feedback.x_hat[2], np.log10(0.02))
+    assert_close(u, controller.policy(0.0, feedback.x_hat[:2], R_torque=0.02))
+    assert not np.allclose(u, controller.policy(0.0, feedback.x_hat[:2], R_torque=0.5))
+    with pytest.raises(ValueError, match=r"R_torque from 0.01 to 1, .* got 2"):
+        feedback.step([0.3], R_torque=2)

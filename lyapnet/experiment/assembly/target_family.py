@@ -175,8 +175,8 @@ class TargetsOfMembers:
         targets = self._through(basis) if len(nodes) <= MOST_MEMBERS else None
         if targets is None or not self._is_accurate(targets, tested):
             raise UsageError(
-                f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials through "
-                f"{min(len(nodes), MOST_MEMBERS)} members miss; narrow the family, or write target_control."
+                f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials "
+                f"through {min(len(nodes), MOST_MEMBERS)} members miss; narrow the family, or write target_control."
             )
         return targets
 
@@ -201,12 +201,13 @@ class TargetsOfMembers:
         return InterpolatedTargets(basis, points, torch.cat([middle.x, middle.u]), len(middle.x), self.solved)
 
     def _is_accurate(self, targets: InterpolatedTargets, tested: Tensor) -> bool:
-        """Whether the interpolated controls hold the interpolated states."""
+        """Whether the interpolated targets are those that are given, and the interpolated controls hold them."""
         middle = self.point(self.center)
         for p in tested:
             search, x = self._search(p), middle.x + targets.shift(p)
+            missed = [abs(float(x[i]) - value) > ACCURATE * (1 + abs(value)) for i, value in self.given(p).items()]
             rate = (search.system.f(x) + search.system.g(x) @ targets.rest(p)) / search.rate
-            if not bool((rate.abs() <= ACCURATE).all()):
+            if any(missed) or not bool((rate.abs() <= ACCURATE).all()):
                 return False
         return True
 

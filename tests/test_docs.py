@@ -131,7 +131,8 @@ def is_key(name: str) -> bool:
         "target",
         *(f"{part}.parameters" for part in parts),
     )
-    return name in {*KNOWN, *SECTIONS} or name.rpartition(".")[0] in open_ended
+    weight = re.fullmatch(r"family\.cost\.(Q|R|Q_T)\.\w+", name) is not None
+    return name in {*KNOWN, *SECTIONS} or name.rpartition(".")[0] in open_ended or weight
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)

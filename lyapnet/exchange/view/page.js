@@ -374,6 +374,7 @@ function offerParameters() {
     return label;
   }));
   element("follow").hidden = element("keep").hidden = !parameters.length;
+  if (parameters.length) for (let k = 0; k < 10; k++) closedLoop(facts.first); // the browser compiles what a slider needs
 }
 // A function that acts once it has not been called for some milliseconds.
 function resting(milliseconds, act) {

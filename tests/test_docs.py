@@ -36,6 +36,11 @@ def test_prose_is_wrapped(page):
     assert not long
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_no_merge_is_left_half_done(page):
+    assert not re.search(r"^(<<<<<<<|=======|>>>>>>>)( |$)", PAGES[page], re.MULTILINE)
+
+
 def without_code(text: str) -> str:
     return re.sub(r"`[^`]*`", "", FENCED.sub("", text))
 

@@ -16,7 +16,7 @@ from lyapnet.exchange.export.law import Law
 from lyapnet.graphs.c_functions import c_function, helpers
 from lyapnet.graphs.c_text import Tables, literal
 
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 FAST = ("-std=c99", "-O3")
 NAME = "lyapnet"  # what names begin with, unless told otherwise
 
@@ -39,7 +39,7 @@ def sources(controller: Controller, law: Law, about: Mapping[str, str], name: st
         ),
         strict=True,
     )
-    lines = "\n   ".join(f"{key}: {value}" for key, value in {**about, "stack": f"{max(stack)} bytes"}.items())
+    lines = "\n   ".join(f"{key}: {value}" for key, value in {**about, "stack": f"{8 * max(stack)} bytes"}.items())
     comment = "/* " + lines.replace("*/", "* /").replace("/*", "/ *") + " */\n"
     macro = name.upper()
     parameter = f", const double p[{macro}_PARAMETERS]" if "p" in law.arguments else ""

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import State
+from lyapnet.base.types import Control, State
 from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
 from lyapnet.task.input_disturbances import DisturbedSystem
-from lyapnet.task.outputs import Outputs
+from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 
@@ -34,6 +34,7 @@ class OutputFeedback:
         drift: see KalmanFilter.
         deviation: standard deviation of the first estimate, (n,).
         around_state: whether evaluations draw the first estimate around x₀ by this deviation, or take the centre of X₀.
+        controller: the Controller whose law it is, for exports.
 
     Raises:
         UsageError: unknown kind.
@@ -41,16 +42,17 @@ class OutputFeedback:
 
     problem: Problem
     filter: KalmanFilter
+    state_of_law: State  # a state that its law takes: its length, precision and device
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
-        deviation: Deviations, around_state: bool = False,
+        deviation: Deviations, around_state: bool = False, controller: Any = None,
     ):  # fmt: skip
         if kind not in FILTERS:
             raise UsageError(f"Expected an estimator as one of {', '.join(FILTERS)}, got {kind!r}; choose one of them.")
         self.law, self.kind, self.outputs = law, kind, outputs
-        self.deviation, self.around_state = deviation, around_state
-        self._state_of_law = problem.initial_states.lower[: law.system.n]  # its precision, device and length
+        self.deviation, self.around_state, self.controller = deviation, around_state, controller
+        self.state_of_law = problem.initial_states.lower[: law.system.n]
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
         self._controls = problem.controls
         self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
@@ -115,11 +117,10 @@ class OutputFeedback:
     @property
     def d_hat(self) -> Any:
         """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 where none is estimated."""
-        return in_form_of(self._like, self._d_hat)
+        return in_form_of(self._like, self._disturbances(self._belief.x))
 
-    @property
-    def _d_hat(self) -> Tensor:
-        return self._belief.x[..., self.problem.system.n - len(self._disturbed) :]
+    def _disturbances(self, x: State) -> Tensor:
+        return x[..., self.problem.system.n - len(self._disturbed) :]
 
     @property
     def P(self) -> Any:
@@ -139,13 +140,22 @@ class OutputFeedback:
             ValueError: the shapes do not fit, or a reading is infinite.
         """
         self.observe(y, applied)
-        like = self._state_of_law
+        like = self.state_of_law
         u = self.law(like.new_tensor(self._t), self._belief.x[..., : len(like)].to(like)).detach()
-        if self._disturbed:
-            disturbed = torch.tensor(self._disturbed, device=u.device)
-            u = self._controls.project(u.index_add(-1, disturbed, self._d_hat.to(u), alpha=-1))
+        u = self.without_disturbances(u, self._belief.x)
         self._u = u.double().cpu()
         return in_form_of(y, u)
+
+    def without_disturbances(self, u: Control, x: State) -> Control:
+        """u − d̂ within the limits, for the estimate x (*batch, n); u where no disturbance is estimated."""
+        if not self._disturbed:
+            return u
+        disturbed = torch.tensor(self._disturbed, device=u.device)
+        return self._controls.project(u.index_add(-1, disturbed, self._disturbances(x).to(u), alpha=-1))
+
+    def corrected(self, belief: Belief, y: Readings) -> Belief:
+        """The belief after readings y, with parameters within their ranges."""
+        return self._with_parameters_in_range(self.filter.update(belief, y))
 
     @torch.no_grad()
     def observe(self, y: Any, applied: Any = None) -> None:
@@ -166,7 +176,7 @@ class OutputFeedback:
         else:
             u = self._u if applied is None else self._applied(applied, self._u)
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
-        self._belief = self._with_parameters_in_range(self.filter.update(belief, readings))
+        self._belief = self.corrected(belief, readings)
 
     @staticmethod
     def _applied(given: Any, own: Tensor) -> Tensor:

@@ -23,35 +23,67 @@ LOOSER = 1e3  # for a law that compares costs: rounding decides between controls
 Evaluate = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]  # t (k,), x (k, n) ↦ u (k, m), V (k,)
 
 
+class Points(NamedTuple):
+    """What exports are held against: times, states, and the box that these states are in."""
+
+    t: Tensor  # (k,)
+    x: Tensor  # (k, n)
+    lower: Tensor  # (n,)
+    upper: Tensor  # (n,)
+
+
+class LoopAgreement(NamedTuple):
+    """The largest differences of an exported loop from the loop in Python, over closed loops from noisy readings."""
+
+    steps: int
+    control: float  # of u, relative to the largest |u|
+    estimate: float  # of x̂, relative to the largest of each state
+    covariance: float  # of P, relative to the largest of its entries
+
+    def __str__(self) -> str:
+        return (
+            f"over {self.steps} steps of closed loops u is within {self.control:.1e} of the largest |u|, the estimate "
+            f"within {self.estimate:.1e}, and its covariance within {self.covariance:.1e}"
+        )
+
+
 class Agreement(NamedTuple):
     """The largest differences of an export from its controller."""
 
     states: int
     control: float  # of |u − u'|, relative to the largest |u|
     value: float  # of |V − V'|, relative to the largest |V|
+    loop: LoopAgreement | None = None  # of the loop with an estimator, where that was exported too
 
     def __str__(self) -> str:
-        return (
+        law = (
             f"on {self.states} states u is within {self.control:.1e} of the largest |u|, and V within "
             f"{self.value:.1e} of the largest |V|"
         )
+        return law if self.loop is None else f"{law}; {self.loop}"
 
 
-def verify(controller: Controller, evaluate: Evaluate) -> Agreement:
+def verify(
+    controller: Controller, evaluate: Evaluate, tried: Points | None = None, dtype: torch.dtype = torch.float64
+) -> Agreement:
     """Hold an export against its controller: on states of closed loops, and around them, up to and after T.
+
+    Args:
+        tried: `points` of the controller, if they are known.
+        dtype: the precision of the export.
 
     Raises:
         ExportError: they differ by more than rounding.
     """
-    t, x = points(controller)
+    t, x, *_ = points(controller) if tried is None else tried
     law = controller.law
     with torch.no_grad():
         expected = law.at_any_time(t, x), law.V.at_any_time(t, x)
     found = evaluate(t.double().cpu().numpy(), x.double().cpu().numpy())
     differences = [_difference(own, other) for own, other in zip(expected, found, strict=True)]
-    agreement = Agreement(len(t), *differences)
+    agreement = Agreement(len(t), differences[0], differences[1])
     looser = LOOSER if isinstance(law.policy, LookaheadPolicy) else 1
-    if not max(differences) <= looser * TOLERANCES[x.dtype]:
+    if not max(differences) <= looser * max(TOLERANCES[x.dtype], TOLERANCES[dtype]):
         raise ExportError(
             f"Expected the controller's own u and V, got others: {agreement}; report this with f, g, the cost and the "
             "network. Nothing was written."
@@ -59,8 +91,8 @@ def verify(controller: Controller, evaluate: Evaluate) -> Agreement:
     return agreement
 
 
-def points(controller: Controller) -> tuple[Tensor, Tensor]:
-    """(t (k,), x (k, n)) that exports are held against."""
+def points(controller: Controller) -> Points:
+    """The states that exports are held against: half of them of closed loops, the others around these."""
     generator = stream(0, TEST, 1)
     x0 = controller.initial_states.sample(LOOPS, generator).to(controller.initial_states.lower)
     loops = controller.rollout(x0)
@@ -69,12 +101,14 @@ def points(controller: Controller) -> tuple[Tensor, Tensor]:
     visited, when = loops.x.reshape(-1, x0.shape[-1])[chosen], loops.t[chosen // LOOPS]
     lower, upper = visited.amin(0), visited.amax(0)
     share = torch.rand(STATES - len(chosen), x0.shape[-1], generator=generator, dtype=torch.float64).to(x0)
-    around = lower + (upper - lower) * ((1 + 2 * AROUND) * share - AROUND)
-    for i in controller.system.constants:  # what V was told of
-        around[:, i] = around[:, i].clamp(controller.initial_states.lower[i], controller.initial_states.upper[i])
+    low, high = lower - AROUND * (upper - lower), upper + AROUND * (upper - lower)
+    constants = list(controller.system.constants)  # what V was told of
+    low[constants] = controller.initial_states.lower[constants]
+    high[constants] = controller.initial_states.upper[constants]
+    around = (lower + (upper - lower) * ((1 + 2 * AROUND) * share - AROUND)).clamp(low, high)
     until = AFTER * controller.horizon.duration
     then = until * torch.rand(len(around), generator=generator, dtype=torch.float64).to(x0)
-    return torch.cat([when, then]), torch.cat([visited, around])
+    return Points(torch.cat([when, then]), torch.cat([visited, around]), low, high)
 
 
 def _difference(own: Tensor, other: NDArray) -> float:

@@ -101,7 +101,7 @@ def test_in_python_it_is_one_state_after_another(kind):
 def test_what_follows_T_is_inside(beyond, tmp_path):
     controller = controller_of("the HJB law", beyond)
     _, agreement = export(controller, tmp_path / "law", "c")
-    t, _ = points(controller)
+    t, *_ = points(controller)
     assert (t > controller.horizon.duration).any(), "they are among the states that it is held against"
     assert agreement.control < 1e-9
     assert beyond in (tmp_path / "law" / "policy.h").read_text()
@@ -122,7 +122,7 @@ def test_a_law_that_is_not_the_controllers_is_not_kept(rule, monkeypatch, tmp_pa
 def test_limits_hold_to_the_last_bit(tmp_path):
     controller = controller_of("a limit, held")
     export(controller, tmp_path / "law", "c")
-    t, x = points(controller)
+    t, x, *_ = points(controller)
     u = controller.policy(t, x)
     assert (u.abs() == 8).any()
     assert "larger(" in (text := (tmp_path / "law" / "policy.c").read_text())

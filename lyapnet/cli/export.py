@@ -13,15 +13,17 @@ from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimato
 @of_a_controller
 def export(
     given: Given,
-    to: Annotated[str, typer.Option(help="c, onnx or torch.")],
+    to: Annotated[str, typer.Option(help="c, fmu, onnx or torch.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
     name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
     beyond: Annotated[
         str | None, typer.Option(help="The law after T: hold, receding or riccati; else that which holds the goal.")
     ] = None,
     dtype: Annotated[str, typer.Option(help="Of the numbers in C: float64 or float32.")] = "float64",
+    fmi: Annotated[str, typer.Option(help="The interface of an fmu: 2.0 or 3.0.")] = "2.0",
     estimator: Annotated[
-        str | None, typer.Option(help="In C, also the loop with an estimator of states that are not measured: ekf.")
+        str | None,
+        typer.Option(help="In C and fmu, also the loop with an estimator of states that are not measured: ekf."),
     ] = None,
     outputs: Measured = None,
     deviation: FirstDeviation = None,
@@ -29,9 +31,10 @@ def export(
 ) -> None:
     """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
 
-    c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. onnx is a model (t, x) ↦ (u, V) of one
-    state, with p beside x for a family; torch is the same for torch.export.load. With --estimator the C has a loop
-    too, readings y ↦ u with a step for each Δt, held against Python's over 10 000 steps.
+    c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. fmu is a unit for
+    co-simulation with that C inside. onnx is a model (t, x) ↦ (u, V) of one state, with p beside x for a family; torch
+    is the same for torch.export.load. With --estimator c and fmu have the loop, readings y ↦ u with a step for each Δt,
+    held against Python's over 10 000 steps.
     """
     from lyapnet.exchange.export import export as write
 
@@ -44,7 +47,7 @@ def export(
         if exported is None:
             raise UsageError("Expected --outputs, or outputs in the run's YAML, with --estimator, got none; name them.")
     given.report("writing and verifying")
-    paths, agreement = write(exported, out, to, given.checkpoint, name, dtype)
+    paths, agreement = write(exported, out, to, given.checkpoint, name, dtype, fmi)
     given.report.rest()
     notes = Console(highlight=False, markup=False)
     if beyond is None:

@@ -23,7 +23,8 @@ from lyapnet.graphs.c_text import Tables, in_single_precision, literal
 from lyapnet.task.domain import SLACK
 from lyapnet.task.sets import ControlBox, ControlSet
 
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+FLAGS = (*STRICT, "-O2")
 FAST = ("-std=c99", "-O3")
 NAME = "lyapnet"  # what names begin with, unless told otherwise
 

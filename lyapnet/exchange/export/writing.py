@@ -12,14 +12,14 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import write_atomically
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.output_feedback import OutputFeedback
-from lyapnet.exchange.export import c, programs
+from lyapnet.exchange.export import c, fmu, programs
 from lyapnet.exchange.export.c_loop import CompiledLoop, LoopTraces, verify_loop
 from lyapnet.exchange.export.facts import facts_of
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Agreement, points, verify
 
-FORMATS = {"c": "", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
-IN_C = ("c",)
+FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
+IN_C = ("c", "fmu")
 PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
@@ -43,6 +43,7 @@ def export(
     checkpoint: Path | None = None,
     name: str = c.NAME,
     dtype: str = "float64",
+    fmi: str = "2.0",
 ) -> Exported:
     """Write u(t, x) and V(t, x) of a controller for use without lyapnet; in C also its loop with an estimator.
 
@@ -52,21 +53,24 @@ def export(
 
     Args:
         exported: a controller; or a controller with its estimator, of controller.with_estimator("ekf").
-        path: of a folder for c, of a file for onnx and torch.
-        to: a key of FORMATS: c, C99 without a library; onnx, a model (t, x[, p]) ↦ (u, V) of one state; torch, the
-            same for torch.export.load.
+        path: of a folder for c, of a file for the others.
+        to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; onnx, a model
+            (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load.
         checkpoint: that the controller was loaded from, whose digest is then noted.
         name: what the names in C begin with: several laws in one program need several.
         dtype: of the numbers in C, float64 or float32.
+        fmi: the version of a unit's interface, 2.0 or 3.0.
 
     Raises:
-        UsageError: another format or dtype, a place that cannot be written to, or a name that is none in C.
+        UsageError: another format, dtype or version, a place that cannot be written to, or a name that is none in C.
         ExportError: the law cannot be written in it, or what was written is not that law.
     """
     path = Path(path)
     _require_place(path, to)
     _require_name(name, to, path)
     _require_dtype(dtype, to)
+    if fmi not in fmu.VERSIONS:
+        raise UsageError(f"Expected fmi as one of {', '.join(fmu.VERSIONS)}, got {fmi!r}; choose one of them.")
     loop = exported if isinstance(exported, OutputFeedback) else None
     controller = exported.controller if isinstance(exported, OutputFeedback) else exported
     if controller is None:
@@ -86,7 +90,8 @@ def export(
         draft = Path(folder)
         if to in IN_C:
             style = c.Style(name, DTYPES[dtype])
-            return _write_c(_Written(controller, law, facts, style, loop), draft, path)
+            written = _Written(controller, law, facts, style, loop)
+            return _write_c(written, draft, path) if to == "c" else _write_fmu(written, draft, path, fmi)
         make, write, run = PROGRAMS[to]
         made, file = make(law), draft / path.name
         write(made, file, facts)
@@ -147,7 +152,7 @@ def _require_name(name: str, to: str, path: Path) -> None:
     """Refuse what cannot begin a name in C, a name where there are none, and another one than an earlier export's."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
-    if to != "c" and name != c.NAME:
+    if to not in IN_C and name != c.NAME:
         raise UsageError(f"Expected no name for {to}, got {name!r}; the names in C alone have one.")
     header = path / "policy.h"
     if to == "c" and header.is_file() and f" {name}_control(" not in header.read_text(encoding="utf-8"):
@@ -196,3 +201,14 @@ def _write_c(written: _Written, draft: Path, folder: Path) -> Exported:
             paths.append(folder / file)
             write_atomically(paths[-1], text.encode())
     return Exported(paths, agreement)
+
+
+def _write_fmu(written: _Written, draft: Path, path: Path, version: str) -> Exported:
+    """A unit for co-simulation."""
+    _, agreement = written.verified(draft, c.FLAGS)
+    variables = fmu.variables_of(written.controller, written.law, written.traces)
+    sources, file = written.sources(verified=str(agreement)), draft / path.name
+    looped = written.traces is not None
+    fmu.write_fmu(file, version, sources, variables, written.style, written.controller, looped, draft)
+    write_atomically(path, file.read_bytes())
+    return Exported([path], agreement)

@@ -294,7 +294,13 @@ def test_names_do_not_get_out_of_their_comment(tmp_path):
     [
         (own_controller, "law", "c", ExportError, "reads the values"),
         (lambda: controller_of("the HJB law", "error"), "law", "c", ExportError, "beyond=error"),
-        (lambda: controller_of("the HJB law"), "law", "fortran", UsageError, "Expected a format among c, onnx, torch"),
+        (
+            lambda: controller_of("the HJB law"),
+            "law",
+            "fortran",
+            UsageError,
+            "Expected a format among c, fmu, onnx, torch",
+        ),
         (lambda: controller_of("the HJB law"), "law.bin", "torch", UsageError, "ends in .pt2"),
         (lambda: controller_of("the HJB law"), "none/law", "c", UsageError, "folder that exists"),
         (lambda: controller_of("the HJB law"), "file", "c", UsageError, "Expected a folder for c"),

@@ -96,13 +96,20 @@ static double remainder_of(double a, double b)
 static void sum_products(int k, int n, int step, const double *a, const double *b, double *y)
 {
     for (int i = 0; i < k; i++, b += step) {
-        double s[8] = {0.0};
+        double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, s4 = 0.0, s5 = 0.0, s6 = 0.0, s7 = 0.0;
         int j = 0;
-        for (; j + 8 <= n; j += 8)
-            for (int l = 0; l < 8; l++) s[l] += a[j + l] * b[j + l];
-        for (; j < n; j++) s[0] += a[j] * b[j];
-        for (int l = 0; l < 4; l++) s[l] += s[l + 4];
-        y[i] = (s[0] + s[1]) + (s[2] + s[3]);
+        for (; j + 8 <= n; j += 8) {
+            s0 += a[j] * b[j];
+            s1 += a[j + 1] * b[j + 1];
+            s2 += a[j + 2] * b[j + 2];
+            s3 += a[j + 3] * b[j + 3];
+            s4 += a[j + 4] * b[j + 4];
+            s5 += a[j + 5] * b[j + 5];
+            s6 += a[j + 6] * b[j + 6];
+            s7 += a[j + 7] * b[j + 7];
+        }
+        for (; j < n; j++) s0 += a[j] * b[j];
+        y[i] = ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7));
     }
 }
 """,

@@ -128,7 +128,7 @@ def arranged(statements: Sequence[Statement], arrays: Mapping[str, int]) -> tupl
     groups = _joined(_needed(statements))
     numbers = _numbers(groups, arrays)
     lives = _lives(groups, numbers)
-    memory, places = _places({name: arrays[name] for name in lives}, lives)
+    memory, places = _places({name: arrays[name] for name in lives}, lives, groups)
     lines = [f"double {', '.join(f'm{k}[{size}]' for k, size in enumerate(memory))};"] if memory else []
     declared = set[str]()
     for group in groups:
@@ -156,11 +156,15 @@ def _needed(statements: Sequence[Statement]) -> list[Statement]:
 
 
 def _joined(statements: Sequence[Statement]) -> list[Group]:
-    """Statements in groups, each in the last one that takes it: the one before, or one whose results it reads."""
+    """Statements in groups, each in the last one that takes it and whose results it reads.
+
+    Others, such as first values of sums, stay on their own: in an earlier loop they would need memory for longer.
+    """
     groups = list[Group]()
     for statement in statements:
         for k in reversed(range(len(groups))):
-            if groups[k].takes(statement) and (k == len(groups) - 1 or groups[k].feeds(statement)):
+            near = k == len(groups) - 1 and not statement.sizes
+            if groups[k].takes(statement) and (near or groups[k].feeds(statement)):
                 groups[k].add(statement)
                 break
             if groups[k].exchanges(statement):
@@ -202,22 +206,43 @@ def _lives(groups: Sequence[Group], numbers: set[str]) -> dict[str, tuple[int, i
     return lives
 
 
-def _places(sizes: Mapping[str, int], lives: Mapping[str, tuple[int, int]]) -> tuple[list[int], dict[str, int]]:
+def _places(
+    sizes: Mapping[str, int], lives: Mapping[str, tuple[int, int]], groups: Sequence[Group]
+) -> tuple[list[int], dict[str, int]]:
     """The sizes of the memory's parts, and array ↦ its part: the first that is free as long as it lives.
 
     The largest array chooses first, so that no part grows later.
     """
-    memory, tenants, places = list[int](), list[list[tuple[int, int]]](), dict[str, int]()
+
+    def is_past(old: str, new: str) -> bool:
+        end, begin = lives[old][1], lives[new][0]
+        return end < begin or (end == begin and _follows(groups[begin], old, new))
+
+    memory, tenants, places = list[int](), list[list[str]](), dict[str, int]()
     for name in sorted(sizes, key=lambda name: (-sizes[name], lives[name])):
-        first, last = lives[name]
-        free = (k for k, taken in enumerate(tenants) if all(last < begin or end < first for begin, end in taken))
+        free = (
+            k for k, taken in enumerate(tenants) if all(is_past(each, name) or is_past(name, each) for each in taken)
+        )
         place = next(free, len(memory))
         if place == len(memory):
             memory.append(sizes[name])
             tenants.append([])
-        tenants[place].append((first, last))
+        tenants[place].append(name)
         places[name] = place
     return memory, places
+
+
+def _follows(group: Group, old: str, new: str) -> bool:
+    """Whether a new array may take the place of an old one that is read for the last time in the same loops.
+
+    Each pass then has to read its own entry of the old one alone, and before it writes the new one there.
+    """
+    indices = group.entries[old] | group.entries[new]
+    if not group.sizes or len(indices) > 1 or any(each.assigned is None for each in group.statements):
+        return False
+    last = max(k for k, each in enumerate(group.statements) if old in each.entries)
+    first = min(k for k, each in enumerate(group.statements) if new in each.entries)
+    return last <= first and group.statements[first].assigned == new and group.statements[first].visits_once
 
 
 def _lines(group: Group, numbers: set[str], declared: set[str]) -> list[str]:

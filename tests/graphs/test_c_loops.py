@@ -50,6 +50,17 @@ def test_memory_is_used_again_once_the_last_read_is_past():
     assert size == 3 * 4, "v0 is still read at the end"
 
 
+def test_an_entry_that_is_read_for_the_last_time_gives_its_place_to_the_next():
+    first, last = ([4], "v0[i0] = x[i0];"), ([4], "y[i0] = v1[3 - i0];")
+    between, sizes = ([2], "v2[i0] = v0[1 + i0];"), {"v0": 4, "v1": 4, "v2": 2}
+    _, size = lines_of(first, between, ([4], "v1[i0] = v2[0] * v0[i0];"), last, **sizes)
+    assert size == 4 + 2
+    _, size = lines_of(first, between, ([4], "v1[i0] = v2[0] * v0[3 - i0];"), last, **sizes)
+    assert size == 8 + 2, "another pass reads the entry that was written"
+    _, size = lines_of(first, between, ([4, 4], "v1[i1] = v2[0] * v0[i1] + w0[4 * i0 + i1];"), last, **sizes)
+    assert size == 8 + 2, "several passes read the entry"
+
+
 def test_what_nobody_reads_is_left_out():
     lines, size = lines_of(([4], "v0[i0] = x[i0];"), ([4], "v1[i0] = v0[3 - i0];"), ([4], "y[i0] = x[i0];"), v0=4, v1=4)
     assert size == 0

@@ -16,13 +16,12 @@ from lyapnet.base.errors import ExportError
 from lyapnet.base.random_streams import OUTPUTS, TEST, stream
 from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.exchange.export.c import Style, box_table, has_limits, numbers_of
-from lyapnet.exchange.export.verification import AFTER, LOOSER, STATES, TOLERANCES, LoopAgreement, Points
+from lyapnet.exchange.export.verification import AFTER, STATES, LoopAgreement, Points, tolerance_of
 from lyapnet.graphs.c_functions import c_function
 from lyapnet.graphs.c_text import Tables, literal
 from lyapnet.graphs.tracing import core_trace
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.task.domain import SLACK
-from lyapnet.value.policy import LookaheadPolicy
 
 MISSING = 0.05  # share of the readings that are left out where the loop is compared
 ELSEWHERE = 0.05  # share of the steps at which the plant gets another control there
@@ -88,14 +87,14 @@ class LoopTraces:
         return {"y": readings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind}
 
     def functions(self, tables: Tables) -> tuple[str, int]:
-        """The text of the traced functions, and how many numbers a step has on the stack."""
-        bodies, most = list[str](), 0
+        """The text of the traced functions, and how many numbers a step has on the stack if they become parts of it."""
+        bodies, total = list[str](), 0
         for name, (heads, graph, arguments, results) in self._parts.items():
             body, size = c_function(f"static void {name}_of({heads})", graph, arguments, results, tables)
             bodies.append(body)
-            most = max(most, size)
+            total += size
         own = self.estimated + self.estimated**2 + self.readings + self.controls  # of the function for a step
-        return "\n".join(bodies), most + own
+        return "\n".join(bodies), total + own
 
     def declarations(self, style: Style) -> str:
         """The loop's type and functions for the header."""
@@ -291,8 +290,7 @@ def verify_loop(loop: OutputFeedback, found: CompiledLoop, dtype: torch.dtype) -
                 worst[i] = max(worst[i], np.where(np.isnan(difference), np.inf, difference).max())
             count += 1
     agreement = LoopAgreement(count, *worst.tolist())
-    looser = LOOSER if isinstance(loop.law.policy, LookaheadPolicy) else 1
-    if not max(agreement[1:]) <= looser * max(TOLERANCES[dtype], TOLERANCES[loop.state_of_law.dtype]):
+    if not max(agreement[1:]) <= tolerance_of(loop.law, dtype, loop.state_of_law.dtype):
         raise ExportError(
             f"Expected the loop's own u and estimate, got others: {agreement}; "
             + (

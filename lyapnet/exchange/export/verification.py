@@ -11,6 +11,7 @@ from torch import Tensor
 from lyapnet.base.errors import ExportError
 from lyapnet.base.random_streams import TEST, stream
 from lyapnet.controller.controller import Controller
+from lyapnet.value.law_after_horizon import ContinuedPolicy
 from lyapnet.value.policy import LookaheadPolicy
 
 STATES = 10_000
@@ -19,6 +20,7 @@ AROUND = 0.2  # of the widths of the box of those states, by which the others ma
 AFTER = 1.25  # of T: their latest time
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # relative to the largest |u| and |V|
 LOOSER = 1e3  # for a law that compares costs: rounding decides between controls that cost the same
+MOST = 0.05  # tolerance that no law and no precision may pass
 
 Evaluate = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]  # t (k,), x (k, n) ↦ u (k, m), V (k,)
 
@@ -82,13 +84,18 @@ def verify(
     found = evaluate(t.double().cpu().numpy(), x.double().cpu().numpy())
     differences = [_difference(own, other) for own, other in zip(expected, found, strict=True)]
     agreement = Agreement(len(t), differences[0], differences[1])
-    looser = LOOSER if isinstance(law.policy, LookaheadPolicy) else 1
-    if not max(differences) <= looser * max(TOLERANCES[x.dtype], TOLERANCES[dtype]):
+    if not max(differences) <= tolerance_of(law, x.dtype, dtype):
         raise ExportError(
             f"Expected the controller's own u and V, got others: {agreement}; report this with f, g, the cost and the "
             "network. Nothing was written."
         )
     return agreement
+
+
+def tolerance_of(law: ContinuedPolicy, *precisions: torch.dtype) -> float:
+    """The largest relative difference from a law that counts as rounding, in the coarsest of some precisions."""
+    looser = LOOSER if isinstance(law.policy, LookaheadPolicy) else 1
+    return min(MOST, looser * max(TOLERANCES[each] for each in precisions))
 
 
 def points(controller: Controller) -> Points:

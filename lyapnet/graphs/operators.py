@@ -84,7 +84,7 @@ def _of_library(name: str, domain: tuple[float, float] = ANY, casadi: Any = "", 
 
 
 def _comparison(name: str, sign: str, casadi: Callable[..., Any]) -> Operator:
-    return Operator(name, f"{{0}} {sign} {{1}}", casadi, f"x {sign} y ? ONE : ZERO", (ANY, ANY))
+    return Operator(name, f"{{0}} {sign} {{1}} ? 1.0 : 0.0", casadi, f"x {sign} y ? ONE : ZERO", (ANY, ANY))
 
 
 def _logical(name: str, sign: str, casadi: str) -> list[Operator]:

@@ -117,14 +117,15 @@ class LoopTraces:
         """The loop's functions."""
         loop, problem = self.loop, self.loop.problem
         n, m, p, macro, name = self.estimated, self.controls, self.readings, style.macro, style.name
-        box, domain, known = problem.initial_states, problem.domain, len(tried.lower)
+        box, domain, known = problem.initial_states, loop.controller.problem.domain, len(tried.lower)
         first = problem.controls.project(problem.rest)
         members = [numbers_of(box.center), numbers_of(torch.diag(loop.deviation.square()).flatten()), numbers_of(first)]
         tables = [box_table("first_known", box.lower[:known], box.upper[:known])]
         checks = [f"if (!is_inside({known}, loop->x, known)) code |= {macro}_OUTSIDE;"]
         if domain is not None:
             tables.append(box_table("domain_of_estimates", *domain.narrowed(-SLACK)))
-            checks.append(f"if (!is_inside({n}, loop->x, domain_of_estimates)) code |= {macro}_OUTSIDE_DOMAIN;")
+            size = len(domain.lower)  # further estimates, of what the law is not told, have none
+            checks.append(f"if (!is_inside({size}, loop->x, domain_of_estimates)) code |= {macro}_OUTSIDE_DOMAIN;")
         words = {
             "NAME": name, "MACRO": macro, "N": n, "M": m, "P": p, "KNOWN": known, "FIRST": ", ".join(members),
             "TRUSTED": literal(TRUSTED), "DT": problem.horizon.dt.hex(), "CHECKS": "\n    ".join(checks),

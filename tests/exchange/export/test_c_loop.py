@@ -56,6 +56,30 @@ class Level(ControlAffineSystem):
         return torch.ones(*x.shape, 1).to(x)
 
 
+class Tanks(ControlAffineSystem):
+    """Two tanks in a row, whose levels have a root and so a domain."""
+
+    state_names, state_units = ("upper level", "lower level"), ("m", "m")
+    control_names, control_units = ("pump",), ("L/s",)
+
+    def f(self, x):
+        flow = 0.0144 * torch.sqrt(x)
+        return torch.stack([-flow[..., 0], flow[..., 0] - flow[..., 1]], -1)
+
+    def g(self, x):
+        return x.new_tensor([[0.065], [0.0]]).expand(*x.shape[:-1], 2, 1)
+
+
+TANKS = {
+    "cost": {"Q": [1, 10], "R": 1, "Q_T": [10, 100]},
+    "target": {"lower level": 0.4},
+    "controls": {"lower": 0, "upper": 0.3},
+    "initial_states": {"lower": 0.1, "upper": 0.7},
+    "horizon": {"steps": 60, "dt": 2.0},
+    "outputs": {"measure": ["lower level"], "noise": 0.006, "input_disturbances": {"pump": 0.002}},
+}
+
+
 def controller_of(beyond="riccati", parts=None, **changes):
     """One with the V of the Riccati solution."""
     config = config_from_plain({**TASK, **changes})
@@ -76,6 +100,7 @@ LOOPS = {
     "outputs of the system": lambda: controller_of(
         parts=Parts(system=Seen()), outputs={"noise": [0.01, 0.02]}
     ).with_estimator(),
+    "a domain": lambda: controller_of(parts=Parts(system=Tanks()), **TANKS).with_estimator(),
     "one state": lambda: controller_of(
         parts=Parts(system=Level()), cost={"Q": [1], "R": 0.1, "Q_T": [2]}, outputs={}
     ).with_estimator(measure=['*/ "level" \\ %d'], noise=0.02),
@@ -89,7 +114,7 @@ def compiled_loop(loop, folder, dtype="float64", name="lyapnet"):
     return CompiledLoop(LoopTraces(loop), library_of([folder / "policy.c"], c.FLAGS), style)
 
 
-@pytest.mark.parametrize("kind", sample(LOOPS, 7))
+@pytest.mark.parametrize("kind", sample(LOOPS, 8))
 def test_it_is_pythons_over_ten_thousand_steps(kind, tmp_path):
     loop = LOOPS[kind]()
     paths, agreement = export(loop, tmp_path / "loop", "c")
@@ -145,6 +170,17 @@ def test_readings_that_are_none_and_failures_are_told(tmp_path):
     found.step(np.array([0.2]))
     assert found.code == Bits.OUTSIDE[0] + Bits.OUTSIDE_X0[0]
     assert np.isfinite(x_hat).all()
+
+
+@pytest.mark.gate
+def test_a_loop_says_where_its_estimate_is_outside_of_the_domain(tmp_path):
+    found = compiled_loop(LOOPS["a domain"](), tmp_path / "loop")
+    for _ in range(3):
+        found.step(np.array([0.4]))
+        assert found.code == 0
+    found.memory.x[1] = -0.2
+    found.step(np.array([math.nan]))
+    assert found.code == Bits.OUTSIDE[0] + Bits.OUTSIDE_DOMAIN[0] + Bits.MISSING[0]
 
 
 @pytest.mark.gate

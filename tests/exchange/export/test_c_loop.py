@@ -210,6 +210,7 @@ def test_single_precision_is_near(tmp_path):
     assert all(-0.7 <= each <= 0.5 for each in u), "limits are rounded inwards"
 
 
+@pytest.mark.gate
 def test_a_loop_that_is_not_pythons_is_not_kept(monkeypatch, tmp_path):
     right = c_rules.RULES["_linalg_solve_ex"]
 

@@ -99,6 +99,7 @@ def test_in_python_it_is_one_state_after_another(kind):
         law.value(0.0, [0.0] * (len(x) - 1))
 
 
+@pytest.mark.gate
 @needs_compiler
 def test_a_code_says_where_the_law_was_not_compared():
     controller = controller_of("a limit, held")

@@ -15,6 +15,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.exchange.export import export
 from lyapnet.exchange.export.c import STRICT
 from tests.exchange.export.test_c_loop import LOOPS, controller_of
+from tests.marks import sample
 from tests.problems import untrained
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -37,7 +38,7 @@ def signal(names, values, dt):
     return np.array(rows, dtype=[("time", float), *((name, float) for name in names)])
 
 
-@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("version", sample(VERSIONS, 2))
 def test_it_has_a_description_its_source_and_a_binary(version, tmp_path):
     file = unit_of(LOOPS["one state"](), tmp_path, version, name="level")
     with zipfile.ZipFile(file) as archive:

@@ -1,7 +1,11 @@
 """Interpolation in torch, differentiable, boundable and exportable: measured tables, and curves in time."""
 
+import itertools
 import math
+import operator
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -70,6 +74,88 @@ class Table(nn.Module):
         s = _share_below(x, nodes)
         basis = torch.cat([torch.ones_like(s[..., :1]), *(s**k for k in range(1, self.degree + 1))], -1)
         return (weights * basis[..., None, :]).sum(-1)
+
+
+class Basis(nn.Module, ABC):
+    """Smooth functions of p (*batch, k), as many as nodes, at which values determine their coefficients."""
+
+    @abstractmethod
+    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
+        """The functions at p, as many as `nodes`."""
+
+    @abstractmethod
+    def nodes(self) -> Float[Tensor, "nodes k"]:
+        """The nodes."""
+
+    def coefficients(self, values: Float[Tensor, "nodes *shape"]) -> Float[Tensor, "nodes *shape"]:
+        """c with Σ c_k function_k = values at the nodes."""
+        matrix = torch.stack(self(self.nodes()), -1)
+        return torch.linalg.solve(matrix, values.flatten(1)).unflatten(-1, values.shape[1:])
+
+
+class ChebyshevProducts(Basis):
+    """Products of Chebyshev polynomials T_i(s₁)T_j(s₂)…, of parameters p (*batch, k) scaled to s ∈ [−1, 1].
+
+    Beyond its range a parameter counts as the nearest end of it.
+
+    Args:
+        lower, upper: the range of each parameter, (k,).
+        counts: number of polynomials along each parameter, 1 for one of no extent.
+    """
+
+    center: Float[Tensor, " k"]
+    half_widths: Float[Tensor, " k"]
+
+    def __init__(self, lower: Float[Tensor, " k"], upper: Float[Tensor, " k"], counts: Sequence[int]):
+        super().__init__()
+        half = (upper - lower) / 2
+        self.counts: list[int] = list(counts)
+        self.register_buffer("center", (lower + upper) / 2, persistent=False)
+        self.register_buffer("half_widths", torch.where(half > 0, half, 1.0), persistent=False)
+
+    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
+        axes = []
+        for k, count in enumerate(self.counts):
+            s = ((p[..., k] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
+            axes.append(_by_recurrence(s, torch.ones_like(s), s, count))
+        return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
+
+    def nodes(self) -> Float[Tensor, "nodes k"]:
+        angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.counts]
+        scaled = torch.cartesian_prod(*(a.cos() for a in angles)).reshape(-1, len(angles))
+        return self.center + self.half_widths * scaled
+
+
+class FourierSeries(Basis):
+    """1, cos φ, …, cos Kφ, sin φ, …, sin Kφ with φ = 2πp/P, of one variable p (*batch, 1).
+
+    Args:
+        period: P.
+        count: 2K + 1.
+    """
+
+    def __init__(self, period: float, count: int):
+        super().__init__()
+        self.period, self.highest = period, count // 2
+
+    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
+        phase = p[..., 0] * (2 * math.pi / self.period)
+        cos, sin = phase.cos(), phase.sin()
+        cosines = _by_recurrence(cos, torch.ones_like(cos), cos, self.highest + 1)
+        sines = _by_recurrence(cos, torch.zeros_like(sin), sin, self.highest + 1)
+        return [*cosines, *sines[1:]]
+
+    def nodes(self) -> Float[Tensor, "nodes k"]:
+        count = 2 * self.highest + 1
+        return (torch.arange(count, dtype=torch.float64) * (self.period / count))[:, None]
+
+
+def _by_recurrence(s: Tensor, first: Tensor, second: Tensor, count: int) -> list[Tensor]:
+    """y₀, y₁ and y_k+1 = 2s y_k − y_k−1, `count` of them."""
+    terms = [first, second]
+    while len(terms) < count:
+        terms.append(2 * s * terms[-1] - terms[-2])
+    return terms[:count]
 
 
 class Curve(nn.Module):

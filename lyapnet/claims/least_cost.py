@@ -24,7 +24,7 @@ from lyapnet.prover.verdict import Verdict, verdict_on
 from lyapnet.task.cost import Cost, is_quadratic_about_target
 from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.problem import Problem
-from lyapnet.task.sets import Box, ControlSet
+from lyapnet.task.sets import Box, ControlSet, about_control
 from lyapnet.value.calculus import drift_lie_derivative, gradients, input_lie_derivative
 
 FINE = 5e-5  # accuracy of the bound of e, as a share of the level
@@ -115,7 +115,7 @@ class RiseCondition(DecreaseCondition):
         rise = self.alpha * (V_t + drift_lie_derivative(loop.system, x, V_x)) + loop.cost.state(x)
         b = self.alpha * input_lie_derivative(loop.system, x, V_x)
         R = symmetric(loop.cost.R(x))
-        least = least_over_controls(R, b, loop.cost.rest, self.controls)
+        least = least_over_controls(R, b, loop.cost.rest_at(x), self.controls)
         return -(rise + least) - self.delta, self.height(t, x), -least_pivot(R)
 
     def height(self, t: Time, x: State) -> PerState:
@@ -140,7 +140,7 @@ def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: Co
         return (b * u0).sum(-1) - (b * solve(R, b[..., None])[..., 0]).sum(-1) / 4
     assert controls.limits is not None
     lower, upper = controls.limits
-    u = controls.minimise(R, b - 2 * apply(R, u0.expand(b.shape)))
+    u = controls.minimise(R, about_control(R, b, u0.expand(b.shape)))
     slope = 2 * apply(R, u - u0) + b
     beyond = torch.minimum(slope * (lower - u), slope * (upper - u)).sum(-1)
     return quadratic_form(R, u - u0) + (b * u).sum(-1) + beyond

@@ -256,7 +256,7 @@ class Controller:
         system = self.system
         if not isinstance(system, FamilySystem) or self._config is None:
             raise UsageError("Expected a controller of a family, got one of a single problem; add family to the YAML.")
-        config, parts, p = member(self.config, self._parts, system, parameters)
+        config, parts, p = member(self.config, self._parts, self.problem, parameters)
         problem = build_problem(config, parts).to(self.initial_states.lower.device)
         V = AtParameters(self.V, self.initial_states.lower.new_tensor(p))
         rollout = build_rollout(config, problem, V)

@@ -1,6 +1,7 @@
 """A controller that reads noisy outputs instead of the state: an estimator, and the law at its estimate."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from lyapnet.task.input_disturbances import DisturbedSystem
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
 from lyapnet.value.law_after_horizon import ContinuedPolicy
+
+ROUNDING = 1e-6  # by which a setting may exceed its range, relative to it: a problem in float32 has rounded ends
 
 
 class OutputFeedback:
@@ -43,6 +46,7 @@ class OutputFeedback:
     problem: Problem
     filter: KalmanFilter
     state_of_law: State  # a state that its law takes: its length, precision and device
+    settings: dict[str, int]  # those of a family: name ↦ index of the state
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
@@ -56,6 +60,7 @@ class OutputFeedback:
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
         self._controls = problem.controls
         self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
+        self.settings = {problem.system.state_names[i]: i for i in problem.system.settings}
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 
@@ -85,17 +90,19 @@ class OutputFeedback:
             )
         if not (bool(first.isfinite().all()) and math.isfinite(t)):
             raise ValueError(f"Expected finite x_hat and t, got {first.tolist()} and {t}; give numbers.")
-        self._belief, self._u, self._t = Belief(first, covariance), None, float(t)
+        self._belief, self._u, self._t, self._began = Belief(first, covariance), None, float(t), 0.0
         self._like: Any = x_hat if x_hat is not None else np.empty(0)
 
     def draw_first(self, x0: State, generator: torch.Generator) -> State:
         """A first estimate for each x₀: the centre of X₀, or around x₀ in states that X₀ fixes.
 
-        With a deviation given it is around x₀ in all states. Of parameters and disturbances it is always the centre.
+        With a deviation given it is around x₀ in all states. Of parameters and disturbances it is always the centre,
+        but settings, such as targets, are those of x₀.
         """
         box, constants = self.problem.initial_states, list(self.problem.system.constants)
         around = (box.widths == 0) | self.around_state
         around[constants] = False
+        around[list(self.settings.values())] = True
         near = x0 + self.deviation * torch.randn(x0.shape, generator=generator, dtype=torch.float64)
         return torch.where(around, near, box.center)
 
@@ -128,20 +135,25 @@ class OutputFeedback:
         return in_form_of(self._like, self._belief.P)
 
     @torch.no_grad()
-    def step(self, y: Any, applied: Any = None) -> Any:
+    def step(self, y: Any, applied: Any = None, **settings: Any) -> Any:
         """u(t, x̂) (*batch, m) after readings y (*batch, p), within the limits of the controls.
 
         Args:
             y: the readings; NaN for one that is missing.
             applied: the control that the plant received since the last call, if it was not the one returned; of no
                 meaning in the first call.
+            settings: of a family: parameters that the plant does not know, such as a target, from now on; each a number
+                or (*batch,). Those that are left out stay as they are, at first in the middle of their ranges. Where
+                one changes the horizon begins anew.
 
         Raises:
-            ValueError: the shapes do not fit, or a reading is infinite.
+            ValueError: the shapes do not fit, a reading is infinite, or a setting is unknown or outside its range.
         """
         self.observe(y, applied)
+        if settings:
+            self._change(settings)
         like = self.state_of_law
-        u = self.law(like.new_tensor(self._t), self._belief.x[..., : len(like)].to(like)).detach()
+        u = self.law(like.new_tensor(self._t - self._began), self._belief.x[..., : len(like)].to(like)).detach()
         u = self.without_disturbances(u, self._belief.x)
         self._u = u.double().cpu()
         return in_form_of(y, u)
@@ -178,6 +190,28 @@ class OutputFeedback:
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
         self._belief = self.corrected(belief, readings)
 
+    def _change(self, settings: Mapping[str, Any]) -> None:
+        """Take settings; if one differs, the horizon begins now."""
+        x, box = self._belief.x.clone(), self.problem.initial_states
+        for name, value in settings.items():
+            if name not in self.settings:
+                known = ", ".join(self.settings) or "none"
+                raise ValueError(f"Expected settings among {known}, got {name!r}; correct the name, or leave it out.")
+            i = self.settings[name]
+            low, high = float(box.lower[i]), float(box.upper[i])
+            number = _float64(value)
+            if number.ndim and number.shape != x.shape[:-1]:
+                raise ValueError(
+                    f"Expected {name} as a number or of shape {tuple(x.shape[:-1])}, got {tuple(number.shape)}."
+                )
+            room = ROUNDING * max(abs(low), abs(high))
+            if not bool(((low - room <= number) & (number <= high + room)).all()):
+                raise ValueError(f"Expected {name} from {low:g} to {high:g}, for which V was trained, got {value}.")
+            x[..., i] = number
+        if self._u is not None and not torch.equal(x, self._belief.x):
+            self._began = self._t
+        self._belief = self._belief._replace(x=x)
+
     @staticmethod
     def _applied(given: Any, own: Tensor) -> Tensor:
         """The control that the plant received, in the shape of the control that was returned."""
@@ -192,7 +226,8 @@ class OutputFeedback:
     def _with_parameters_in_range(self, belief: Belief) -> Belief:
         """The belief with estimates of parameters p moved into their ranges, beyond which f and V may be undefined."""
         system, box = self.problem.system, self.problem.initial_states
-        parameters = list(system.constants)[: len(system.constants) - len(self._disturbed)]
+        of_plant = list(system.constants)[: len(system.constants) - len(self._disturbed)]
+        parameters = [i for i in of_plant if i not in system.settings]
         if not parameters:
             return belief
         x = belief.x.clone()

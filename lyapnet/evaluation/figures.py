@@ -22,7 +22,7 @@ from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import StateLimits, parts_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlAffineSystem, moving_states
 
 MOST_PANELS = 12  # states, and controls, that a figure over time has a panel for
 MOST_NAMED = 4  # other states whose values fit into a line under a slice
@@ -153,13 +153,12 @@ def _draw_line_region(
 
 def states_and_controls_to_draw(system: ControlAffineSystem) -> tuple[list[int], list[int]]:
     """The indices of the first MOST_PANELS states that move, and of the first MOST_PANELS controls."""
-    moving = [i for i in range(system.n) if i not in system.constants]
-    return moving[:MOST_PANELS], list(range(system.m))[:MOST_PANELS]
+    return moving_states(system)[:MOST_PANELS], list(range(system.m))[:MOST_PANELS]
 
 
 def name_panels_left_out(figure: Figure, system: ControlAffineSystem) -> None:
     """Say above a figure how many states and controls have no panel, if there are some."""
-    states = system.n - len(system.constants)
+    states = len(moving_states(system))
     if max(states, system.m) > MOST_PANELS:
         figure.suptitle(f"at most {MOST_PANELS} of {states} states and of {system.m} controls", fontsize=9)
 
@@ -167,16 +166,14 @@ def name_panels_left_out(figure: Figure, system: ControlAffineSystem) -> None:
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     """States, controls and their limits, V and the cost to go over time, for a batch (b,) of closed loops.
 
-    Dotted lines are the common goal, if there is one, and the control at rest. Parameters of a family have no panel.
+    Dotted lines are the goals, or references, and the controls at rest. Parameters of a family have no panel.
     """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
     drawn, controls = states_and_controls_to_draw(system)
-    x0 = trajectory.x[0]
-    goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # in a family each member has its own
-    one = torch.where((goal - goal[0]).abs().amax(0) <= 1e-9 * (1 + goal[0].abs()), goal[0], torch.nan)
-    one = one if problem.has_goal else torch.full_like(one, torch.nan)
-    at_rest = torch.cat([one, problem.rest[controls]]).tolist()
+    goals, rests = trajectory.x - problem.cost.from_goal(trajectory.x), problem.rest_at(trajectory.x[:-1])
+    wanted = [numpy_of(goals[..., i]) if problem.has_goal else None for i in drawn]
+    wanted += [numpy_of(rests[..., i]) for i in controls]
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in controls]
     columns = _columns(len(curves) + 1)
@@ -184,9 +181,12 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # fits a page without scaling
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels = list(grid.flatten(order="F"))
-    for panel, (label, values_over_time, color), height in zip(panels, curves, at_rest, strict=False):
+    for panel, (label, values_over_time, color), goal in zip(panels, curves, wanted, strict=False):
         panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
-        panel.axhline(height, color=GREY, linewidth=0.6, linestyle=":")
+        if goal is not None and np.ptp(goal) <= 1e-9 * (1 + abs(goal).max()):
+            panel.axhline(goal.flat[0], color=GREY, linewidth=0.6, linestyle=":")
+        elif goal is not None:  # each member of a family has its own, and a reference moves
+            panel.plot(t[: len(goal)], goal, color=GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
     for part in parts_of(problem.constraints):
         if isinstance(part, StateLimits):

@@ -25,6 +25,7 @@ from lyapnet.evaluation.under_noise import NoiseMeasures, measure_under_noise
 from lyapnet.evaluation.with_estimator import EstimatorMeasures, loops_with_estimator, measure_with_estimator
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
+from lyapnet.task.systems import moving_states
 from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
@@ -94,7 +95,7 @@ class Evaluation(NamedTuple):
     def _terminal_errors(self) -> dict[str, float]:
         """The mean distance of each state from its goal at T."""
         system, errors = self.problem.system, self.problem.cost.from_goal(self.table.terminal_state).abs().mean(0)
-        return {name: float(errors[i]) for i, name in enumerate(system.state_labels) if i not in system.constants}
+        return {system.state_labels[i]: float(errors[i]) for i in moving_states(system)}
 
     def write(self, path: Path) -> None:
         """Write the table as CSV with a header line of names and units.

@@ -103,7 +103,7 @@ class LatePolicy(nn.Module):
             return self.policy(t, x)
         u = self.computed
         if u is None or t == 0:
-            u = self.model.rest.to(x).expand(*x.shape[:-1], -1)
+            u = self.model.rest_at(x)
         horizon = self.model.horizon
         self.computed = (
             self.policy((t + horizon.dt).clamp(max=horizon.duration), self.model.step(x, u)[0])

@@ -15,6 +15,7 @@ from lyapnet.evaluation.intervals import CONFIDENCE, half_width_of_mean
 from lyapnet.evaluation.under_noise import LOST_EXCESS
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.loop.random_plants import RandomPlants
+from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.expansions import path_under
 
 RARE = 0.999  # probability of errors that are not rare
@@ -37,6 +38,11 @@ class EstimatedLoops(NamedTuple):
         """The normalised estimation error squared (NEES), (x − x̂)ᵀP⁻¹(x − x̂): its expectation is n if P is right."""
         error = self.x - self.x_hat
         return (error * torch.linalg.solve(self.P, error)).sum(-1)
+
+    def estimated(self, system: ControlAffineSystem) -> "EstimatedLoops":
+        """The loops without the settings of a family, which are known."""
+        kept = [i for i in range(system.n) if i not in system.settings]
+        return self._replace(x=self.x[..., kept], x_hat=self.x_hat[..., kept], P=self.P[..., kept, :][..., kept])
 
 
 class EstimatorMeasures(NamedTuple):
@@ -106,7 +112,11 @@ def measure_with_estimator(loops: EstimatedLoops, estimator: OutputFeedback) -> 
     """The measures of some closed loops."""
     from scipy.stats import chi2  # imported here because it takes 0.3 s
 
-    problem, outputs = estimator.problem, estimator.outputs
+    system, outputs = estimator.problem.system, estimator.outputs
+    loops, labels = (
+        loops.estimated(system),
+        [label for i, label in enumerate(system.state_labels) if i not in system.settings],
+    )
     runs, n = loops.x.shape[1:]
     J, known = loops.cost, loops.known_cost
     ratio, half_width = _ratio_of_means(J, known)
@@ -124,7 +134,7 @@ def measure_with_estimator(loops: EstimatedLoops, estimator: OutputFeedback) -> 
         float(known.mean()), float(J.mean()), ratio, half_width, float(lost.double().mean()),
         float(each.mean()), half_width_of_mean(each[:, None]), (low, high), float(inside.double().mean()),
         float((~(n * nees[-1] <= float(chi2.ppf(RARE, n)))).double().mean()),
-        dict(zip(problem.system.state_labels, zip(rms.tolist(), deviation, strict=True), strict=True)),
+        dict(zip(labels, zip(rms.tolist(), deviation, strict=True), strict=True)),
     )  # fmt: skip
 
 

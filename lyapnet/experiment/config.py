@@ -11,7 +11,9 @@ from typing import Any
 
 from omegaconf import MISSING, OmegaConf
 
+from lyapnet.base.errors import UsageError
 from lyapnet.base.sizes import THREADS, check_sizes
+from lyapnet.experiment.csv_columns import read_columns
 from lyapnet.experiment.recipe import STANDARD, with_recipe
 from lyapnet.experiment.schema import Names, check_values, checked, differences, read_yaml, setting
 
@@ -185,6 +187,21 @@ class OutputsConfig:
 
 
 @dataclass
+class ReferenceConfig:
+    """r(t), which states are to follow in the place of a target; the time on it is then the last state."""
+
+    file: str = setting("", "CSV file with the columns t and names of states; it is read into points.")
+    points: dict[str, list[float]] = setting(
+        {}, "Times t in s, rising from 0, and the values of states there, by name."
+    )
+    speed: float = setting(1.0, "How many times as fast as t says.", above=0)
+    periodic: bool = setting(False, "Whether it repeats; its last point is then its first one.")
+    control: list[float] | None = setting(
+        None, "What the cost counts u from; null: the control that follows r, f(r) + g(r)u = ṙ."
+    )
+
+
+@dataclass
 class NetworkConfig:
     """V(t, x). Fields with null use the network's default."""
 
@@ -309,6 +326,7 @@ class Config:
     family: dict[str, list[float]] = setting(
         {}, "Ranges of parameters in V: of the system, and target_STATE; each as [least, greatest]."
     )
+    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
     noise: dict[str, float] = setting(
         {}, "σ of states that noise drives, each as STATE: σ in its unit per √s; see the page on noise.", at_least=0
     )
@@ -347,7 +365,19 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
         UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
     """
     content = read_yaml(path, Config)
-    return config_from_plain({"experiment": Path(path).stem, **content}, overrides)
+    config = config_from_plain({"experiment": Path(path).stem, **content}, overrides)
+    return _with_reference(config, Path(path).parent)
+
+
+def _with_reference(config: Config, folder: Path) -> Config:
+    """The config with the points of the file of its reference, which is found from the folder of the YAML."""
+    reference = config.reference
+    if not reference.file:
+        return config
+    if reference.points:
+        raise UsageError("Expected reference.file or reference.points, got both; leave one out.")
+    points = read_columns(folder / reference.file)
+    return dataclasses.replace(config, reference=dataclasses.replace(reference, file="", points=points))
 
 
 def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:

@@ -5,30 +5,34 @@ family as one problem with n + k states.
 """
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.base.contracts import differences, state_of
 from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.interpolation import Basis
 from lyapnet.base.shapes import Shape
-from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, PerState, State
+from lyapnet.base.types import Control, ControlMatrix, PerState, State
 from lyapnet.graphs.tracing import trace
 from lyapnet.task.constraints import OfFirstStates
 from lyapnet.task.cost import Cost
+from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
 MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
+ROUNDING = 1e-14  # coefficients of targets below this count as zero, relative to the largest state or control
 PREFIX = "target_"  # of parameters that move the target instead of the dynamics
 
 
-class FamilySystem(ControlAffineSystem):
+class FamilySystem(ExtendedSystem):
     """ẋ = f(x; p) + g(x; p)u and ṗ = 0, in the state z = (x, p).
 
     A parameter of the dynamics is an attribute of the system with the name of its constructor's argument, used in f and
@@ -41,22 +45,16 @@ class FamilySystem(ControlAffineSystem):
     """
 
     def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
-        super().__init__()
-        self.system = system
+        super().__init__(system, names, units)
         self.parameters_in_f = {name: i for i, name in enumerate(names) if not name.startswith(PREFIX)}
-        self.state_names = (*system.state_names, *names)
-        self.state_units = (*system.state_units, *units)
-        self.control_names, self.control_units = tuple(system.control_names), tuple(system.control_units)
-        self.angles = tuple(system.angles)
-        self.constants = tuple(range(system.n, system.n + len(names)))
+        own = range(system.n, system.n + len(names))
+        self.constants = (*system.constants, *own)
+        told = [i for i, name in zip(own, names, strict=True) if name not in self.parameters_in_f]
+        self.settings = (*system.settings, *told)
 
     @property
     def title(self) -> str:
         return f"family of {self.system.title}"
-
-    def split(self, z: State) -> tuple[Tensor, Tensor]:
-        """(x, p)."""
-        return z[..., : self.system.n], z[..., self.system.n :]
 
     def joined(self, x: Tensor, parameters: Mapping[str, Any]) -> Tensor:
         """(x, p) from states, and parameters by name, each a scalar or (*batch,).
@@ -76,45 +74,8 @@ class FamilySystem(ControlAffineSystem):
         """The system with parameters (k,), or with different ones for each of a batch of states."""
         return with_attributes(self.system, {name: p[..., i] for name, i in self.parameters_in_f.items()})
 
-    def f(self, x: State) -> State:
-        x, p = self.split(x)
-        return torch.cat([self.member(p).f(x), torch.zeros_like(p)], -1)
-
-    def g(self, x: State) -> InputMatrix:
-        x, p = self.split(x)
-        g = self.member(p).g(x)
-        return torch.cat([g, g.new_zeros(*g.shape[:-2], p.shape[-1], self.m)], -2)
-
-    def dynamics(self, x: State, u: Control) -> State:
-        x, p = self.split(x)
-        return torch.cat([self.member(p).dynamics(x, u), torch.zeros_like(p)], -1)
-
-    @property
-    def noisy(self) -> bool:
-        return self.system.noisy
-
-    def noise(self, x: State) -> Noise:
-        """σ(x; p) of each member, with zeros for the parameters."""
-        x, p = self.split(x)
-        member: Any = self.member(p)
-        sigma = member.noise(x)
-        return torch.cat([sigma, sigma.new_zeros(*sigma.shape[:-2], p.shape[-1], sigma.shape[-1])], -2)
-
-    @property
-    def has_output(self) -> bool:
-        return self.system.has_output
-
-    def output(self, x: State) -> Tensor:
-        """h(x; p) of each member."""
-        x, p = self.split(x)
-        member: Any = self.member(p)
-        return member.output(x)
-
-    def inverse_mass(self, x: State) -> ControlMatrix:
-        """BᵀM(q; p)⁻¹B of each member, if the system has a mass matrix."""
-        x, p = self.split(x)
-        member: Any = self.member(p)
-        return member.inverse_mass(x)
+    def at(self, s: Tensor) -> ControlAffineSystem:
+        return self.member(s)
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
         n = self.system.n
@@ -122,34 +83,106 @@ class FamilySystem(ControlAffineSystem):
         return with_attributes(self.system, values).draw(x[:n], u)
 
 
-class FamilyCost(Cost):
-    """The cost of each member: q(x − E(p − p̄)) and φ(x − E(p − p̄)), and R(x) or R(x; p).
+class Targets(nn.Module, ABC):
+    """The targets of a family's members: p ↦ x*(p) − x*(p̄) and u*(p)."""
+
+    @abstractmethod
+    def shift(self, p: Tensor) -> State:
+        """x*(p) − x*(p̄), (*batch, n), of parameters (*batch, k)."""
+
+    def rest(self, p: Tensor) -> Control | None:
+        """u*(p), (*batch, m); None: the same for all members."""
+        return None
+
+
+class LinearTargets(Targets):
+    """x*(p) − x*(p̄) = E(p − p̄), and one u* for all members.
 
     Args:
-        cost: q, R and φ at p̄, functions of x.
-        shift: E (n, k), the derivative of the target by p.
+        slope: E, (n, k).
+        center: p̄, (k,).
+    """
+
+    slope: Float[Tensor, "n k"]
+    center: Float[Tensor, " k"]
+
+    def __init__(self, slope: Tensor, center: Tensor):
+        super().__init__()
+        self.register_buffer("slope", slope, persistent=False)
+        self.register_buffer("center", center, persistent=False)
+
+    def shift(self, p: Tensor) -> State:
+        return (p - self.center) @ self.slope.mT
+
+
+class InterpolatedTargets(Targets):
+    """x*(p) and u*(p) as polynomials, or other functions, through the targets of some members.
+
+    Args:
+        basis: functions of p.
+        points: (x*, u*) at the nodes of the basis, (nodes, n + m).
+        center: (x*, u*) at p̄, (n + m,).
+        n: number of states.
+        solved: indices of the states that were solved for.
+    """
+
+    coefficients: Float[Tensor, "nodes n_plus_m"]
+    rest_at_center: Float[Tensor, " m"]
+
+    def __init__(self, basis: Basis, points: Tensor, center: Tensor, n: int, solved: Sequence[int] = ()):
+        super().__init__()
+        self.basis, self.n, self.solved = basis, n, list(solved)
+        away = basis.coefficients(points - center)
+        away[away.abs() < ROUNDING * points.abs().amax(0)] = 0.0
+        self.register_buffer("coefficients", away, persistent=False)
+        self.register_buffer("rest_at_center", center[n:], persistent=False)
+
+    def _from_center(self, p: Tensor) -> Tensor:
+        """(x*, u*)(p) − (x*, u*)(p̄)."""
+        return torch.stack(self.basis(p), -1) @ self.coefficients
+
+    def shift(self, p: Tensor) -> State:
+        return self._from_center(p)[..., : self.n]
+
+    def rest(self, p: Tensor) -> Control:
+        return self.rest_at_center + self._from_center(p)[..., self.n :]
+
+
+class FamilyCost(Cost):
+    """The cost of each member: q and φ of x − (x*(p) − x*(p̄)), u counted from u*(p), and R(x) or R(x; p).
+
+    With a reference it is that at each time on it, p = (τ,).
+
+    Args:
+        cost: q, R, φ and u* at p̄, functions of x.
+        targets: x*(p) and u*(p).
         center: p̄ (k,).
+        n: number of states x.
         R: z ↦ (*batch, m, m), if it depends on p; None: R of the cost.
     """
 
-    shift: Float[Tensor, "n k"]
-    center: Float[Tensor, " k"]
-
-    def __init__(self, cost: Cost, shift: Tensor, center: Tensor, R: Callable[[State], ControlMatrix] | None = None):
+    def __init__(
+        self, cost: Cost, targets: Targets, center: Tensor, n: int, R: Callable[[State], ControlMatrix] | None = None
+    ):
         super().__init__()
-        self.cost, self.R_of_member = cost, R
-        self.register_buffer("shift", shift, persistent=False)
-        self.register_buffer("center", center, persistent=False)
-        self.goal = torch.cat([shift.new_zeros(len(shift)) if cost.goal is None else cost.goal, center])
+        self.cost, self.targets, self.n, self.R_of_member = cost, targets, n, R
+        self.goal = torch.cat([center.new_zeros(n) if cost.goal is None else cost.goal, center])
         self.rest, self.R_constant, self.R_inverse = cost.rest, cost.R_constant, cost.R_inverse
 
     def _centred(self, z: Tensor) -> Tensor:
-        n = len(self.shift)
-        return z[..., :n] - (z[..., n:] - self.center) @ self.shift.mT
+        return z[..., : self.n] - self.targets.shift(z[..., self.n :])
 
     def from_goal(self, x: State) -> State:
-        n = len(self.shift)
-        return torch.cat([self.cost.from_goal(self._centred(x)), torch.zeros_like(x[..., n:])], -1)
+        return torch.cat([self.cost.from_goal(self._centred(x)), torch.zeros_like(x[..., self.n :])], -1)
+
+    def target(self, p: Tensor) -> State:
+        """x*(p), (*batch, n)."""
+        assert self.goal is not None
+        return self.goal[: self.n].to(p) + self.targets.shift(p)
+
+    def rest_at(self, x: State) -> Tensor | None:
+        own = self.targets.rest(x[..., self.n :])
+        return self.cost.rest_at(x[..., : self.n]) if own is None else own
 
     def state(self, x: State) -> PerState:
         return self.cost.state(self._centred(x))
@@ -158,7 +191,14 @@ class FamilyCost(Cost):
         return self.cost.terminal(self._centred(x))
 
     def R(self, x: State) -> ControlMatrix:
-        return self.cost.R(x[..., : len(self.shift)]) if self.R_of_member is None else self.R_of_member(x)
+        return self.cost.R(x[..., : self.n]) if self.R_of_member is None else self.R_of_member(x)
+
+
+def family_cost_of(cost: Any) -> FamilyCost:
+    """The cost of a family, of which another may be made."""
+    while not isinstance(cost, FamilyCost):
+        cost = cost.cost
+    return cost
 
 
 def with_constant_states(problem: Problem, system: ControlAffineSystem, initial_states: Box) -> Problem:
@@ -170,7 +210,8 @@ def with_constant_states(problem: Problem, system: ControlAffineSystem, initial_
         initial_states: X₀ × P.
     """
     n, center = problem.system.n, initial_states.center
-    cost = FamilyCost(problem.cost, center.new_zeros(n, len(center) - n), center[n:])
+    unmoved = LinearTargets(center.new_zeros(n, len(center) - n), center[n:])
+    cost = FamilyCost(problem.cost, unmoved, center[n:], n)
     h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
     return problem.replaced(system=system, cost=cost, initial_states=initial_states, constraints=h)
 

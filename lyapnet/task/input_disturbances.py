@@ -1,12 +1,11 @@
 """Constant disturbances of controls, as further states: ẋ = f(x) + g(x)(u + d), ḋ = 0."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
-from torch import Tensor
 
-from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, State
+from lyapnet.base.types import Control, Noise, State
+from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.family import with_constant_states
 from lyapnet.task.noise import Noise as NoiseOfTask
 from lyapnet.task.noise import SystemNoise
@@ -15,7 +14,7 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
 
-class DisturbedSystem(ControlAffineSystem):
+class DisturbedSystem(ExtendedSystem):
     """ẋ = f(x) + g(x)(u + Ed) and ḋ = 0, in the state (x, d).
 
     Args:
@@ -24,58 +23,18 @@ class DisturbedSystem(ControlAffineSystem):
     """
 
     def __init__(self, system: ControlAffineSystem, controls: Sequence[int]):
-        super().__init__()
-        self.system, self.disturbed = system, list(controls)
         names = [f"disturbance of {system.control_names[i]}" for i in controls]
-        self.state_names = (*system.state_names, *names)
-        self.state_units = (*system.state_units, *(system.control_units[i] for i in controls))
-        self.control_names, self.control_units = tuple(system.control_names), tuple(system.control_units)
-        self.angles = tuple(system.angles)
+        super().__init__(system, names, [system.control_units[i] for i in controls])
+        self.disturbed = list(controls)
         self.constants = (*system.constants, *range(system.n, system.n + len(names)))
 
-    def split(self, z: State) -> tuple[Tensor, Control]:
-        """(x, Ed)."""
-        x, d = z[..., : self.system.n], z[..., self.system.n :]
-        return x, z.new_zeros(*z.shape[:-1], self.m).index_copy(-1, torch.tensor(self.disturbed), d)
-
     def f(self, x: State) -> State:
-        x, d = self.split(x)
-        return self._append(self.system.dynamics(x, d))
-
-    def g(self, x: State) -> InputMatrix:
-        x, _ = self.split(x)
-        return self._append(self.system.g(x).mT).mT
+        return self.dynamics(x, x.new_zeros(*x.shape[:-1], self.m))
 
     def dynamics(self, x: State, u: Control) -> State:
         x, d = self.split(x)
-        return self._append(self.system.dynamics(x, u + d))
-
-    @property
-    def noisy(self) -> bool:
-        return self.system.noisy
-
-    def noise(self, x: State) -> Noise:
-        """σ(x), with zeros for d."""
-        system: Any = self.system
-        return self._append(system.noise(self.split(x)[0]).mT).mT
-
-    @property
-    def has_output(self) -> bool:
-        return self.system.has_output
-
-    def output(self, x: State) -> Tensor:
-        """h(x)."""
-        system: Any = self.system
-        return system.output(self.split(x)[0])
-
-    def inverse_mass(self, x: State) -> ControlMatrix:
-        """BᵀM(q)⁻¹B, if the system has a mass matrix."""
-        system: Any = self.system
-        return system.inverse_mass(self.split(x)[0])
-
-    def _append(self, rates: Tensor) -> Tensor:
-        """Append zeros for d along the last axis."""
-        return torch.cat([rates, rates.new_zeros(*rates.shape[:-1], len(self.disturbed))], -1)
+        disturbed = u.index_add(-1, torch.tensor(self.disturbed), d)
+        return torch.cat([self.system.dynamics(x, disturbed), self.rates(d)], -1)
 
 
 class NoiseOfFirstStates(NoiseOfTask):

@@ -35,12 +35,13 @@ RECORD_TOLERANCE = 1e-4  # relative to a component's largest entry: difference b
 
 
 class Response(NamedTuple):
-    """One step with u held: F to first order in u, and ℓ to second order."""
+    """One step with u held: F to first order in u, and ℓ to second order, around some u."""
 
     x: State  # F(x, u), the next state
     by_control: Tensor  # F_u/Δt (*batch, n, m); with Euler g(x)
     slope: Control  # ℓ_u of the mean ℓ over the step
     curvature: Tensor  # ℓ_uu (*batch, m, m), symmetric positive definite; with Euler 2R
+    u: Tensor | None  # (*batch, m), the control around which it is; None: zero
 
 
 class Problem(nn.Module):
@@ -139,7 +140,7 @@ class Problem(nn.Module):
         generator = torch.Generator().manual_seed(0)
         x = self.initial_states.sample(TRIED, generator)
         self.check_shapes(x)  # wrong ones may broadcast, and grow by a factor in each step
-        u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
+        u = self.controls.project(self.rest_at(x) + torch.randn(TRIED, self.system.m, generator=generator).to(x))
         states, N = [x], min(self.horizon.steps, GOAL_TEST_STEPS)
         for n in range(1, N + 1):
             x = self.step(x, u)[0]
@@ -157,9 +158,14 @@ class Problem(nn.Module):
 
     @property
     def rest(self) -> Control:
-        """The control at rest u* (m,), which costs nothing; zero without a target."""
+        """The control at rest u* (m,) at the goal, which costs nothing; zero without a target."""
         rest, like = self.cost.rest, self.initial_states.lower
         return like.new_zeros(self.system.m) if rest is None else rest.to(like)
+
+    def rest_at(self, x: State) -> Control:
+        """The control at rest at each state, (*batch, m)."""
+        rest = self.cost.rest_at(x)
+        return (x.new_zeros(self.system.m) if rest is None else rest.to(x)).expand(*x.shape[:-1], -1)
 
     def rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The means of ẋ and ℓ over one step from x with u held, by the integrator of the horizon."""
@@ -184,7 +190,8 @@ class Problem(nn.Module):
         if self.horizon.method == "euler":
             return self._euler_response(x, u)
         n, recording = self.system.n, torch.is_grad_enabled()
-        u = self.rest.expand(*x.shape[:-1], -1) if u is None else u
+        around = self.cost.rest_at(x) if u is None else u
+        u = self.rest_at(x) if u is None else u
         with torch.enable_grad():
             u = u if recording and u.requires_grad else u.detach().requires_grad_()
             # one copy of u for each component of ẋ: all rows of the Jacobian in one backward pass
@@ -202,7 +209,8 @@ class Problem(nn.Module):
             slope,
             self._convex_curvature(torch.stack(bends, -2), x),
         )
-        return Response(*(part if recording else part.detach() for part in parts))
+        after, by_control, slope, curvature = (part if recording else part.detach() for part in parts)
+        return Response(after, by_control, slope, curvature, around)
 
     def _convex_curvature(self, curvature: Tensor, x: State) -> Tensor:
         """ℓ_uu, or 2R if ℓ_uu is not clearly positive definite."""
@@ -210,13 +218,14 @@ class Problem(nn.Module):
         return convex_or((curvature + curvature.mT) / 2, least, least)
 
     def _euler_response(self, x: State, u: Control | None) -> Response:
-        rest = self.cost.rest
+        rest = self.cost.rest_at(x)
         if u is None:
-            rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
+            rest = None if rest is None else rest.expand(*x.shape[:-1], -1)
+            rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest)
             zero = x.new_zeros(self.system.m).expand(*x.shape[:-1], -1)
-            return Response(x + self.horizon.dt * rate, self.system.g(x), zero, 2 * self.cost.R(x))
+            return Response(x + self.horizon.dt * rate, self.system.g(x), zero, 2 * self.cost.R(x), rest)
         after, R2 = x + self.horizon.dt * self.system.dynamics(x, u), 2 * self.cost.R(x)
-        return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2)
+        return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2, u)
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts replaced; noise that a system declares is replaced with the system."""
@@ -410,8 +419,8 @@ class Problem(nn.Module):
                 "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
                 "φ": cost.terminal(x), "U": own.controls.minimise(torch.eye(m, dtype=x.dtype).expand(3, m, m), b),
             }  # fmt: skip
-        if cost.rest is not None:
-            numbers["u*"] = cost.rest.expand(3, m)
+        if (rest := cost.rest_at(x)) is not None:
+            numbers["u*"] = rest.expand(3, m)
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
         if own.noise is not None:

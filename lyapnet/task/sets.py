@@ -136,6 +136,11 @@ class ControlSet(nn.Module, ABC):
         """The point of U closest to each control."""
 
 
+def about_control(R: ControlMatrix, b: Control, center: Tensor | None) -> Control:
+    """b − 2Rū, so that uᵀRu + (b − 2Rū)ᵀu equals (u − ū)ᵀR(u − ū) + bᵀu up to a constant; None: ū = 0."""
+    return b if center is None else b - 2 * apply(R, center)
+
+
 class Unbounded(ControlSet):
     """U = ℝᵐ."""
 

@@ -207,7 +207,7 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
         return answer.x, B, answer.slope, W, _control_set_of_fit(problem).minimise(W / 2, b - apply(W, about))
 
-    about = problem.rest.to(now).expand(*now.shape[:-1], -1)
+    about = problem.rest_at(now)
     led, B, slope, W, best = responses(about)
     for _ in range(NEWTON_STEPS if about_best else 0):
         about = best

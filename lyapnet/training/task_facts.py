@@ -22,6 +22,7 @@ from lyapnet.task.horizon import TABLEAUX
 from lyapnet.task.noise import Noise
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
+from lyapnet.task.systems import moving_states
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
 from lyapnet.training.config_facts import OBSERVABLE, Fact, format_numbers
 from lyapnet.training.learner import Learner
@@ -122,11 +123,11 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     found = observability(ExtendedKalmanFilter(problem, outputs, drift), x, u, deviation)
     fixed = problem.initial_states.widths == 0  # their deviation is no more than a convention
     usual = torch.where(fixed, deviation.maximum(x.flatten(0, 1).std(0)), deviation)
-    vague = [name for name, lost in zip(system.state_names, found.of_first > VAGUE * usual, strict=True) if lost]
-    told = ", ".join(
-        f"{name} {left:.2g}" for name, left in zip(system.state_names, found.deviation.tolist(), strict=True)
-    )
-    condition = f"condition {found.condition:.2g}" if found.rank == system.n else f"rank {found.rank} of {system.n}"
+    estimated = [(i, name) for i, name in enumerate(system.state_names) if i not in system.settings]
+    vague = [name for i, name in estimated if found.of_first[i] > VAGUE * usual[i]]
+    told = ", ".join(f"{name} {float(found.deviation[i]):.2g}" for i, name in estimated)
+    count = len(estimated)
+    condition = f"condition {found.condition:.2g}" if found.rank == count else f"rank {found.rank} of {count}"
     known = f"standard deviations at T: {told}; {condition} of the Gramian along {x.shape[1]} loops of the start"
     if not vague:
         return [Fact(OBSERVABLE, f"yes; {known}")]
@@ -270,7 +271,7 @@ def _mode_facts(problem: Problem, around: Linearisation) -> list[Fact]:
     """The eigenvalues of ẋ = Ax + Bu at the goal, and whether the pair (A, B) is controllable."""
     if around.missing is not None:
         return [Fact("modes", f"unknown: {around.missing.reason}", around.missing.remedy)]
-    moving = [i for i in range(problem.system.n) if i not in problem.system.constants]
+    moving = moving_states(problem.system)
     A, B, dt = around.A[moving][:, moving], around.g[moving], problem.horizon.dt
     extent = problem.initial_states.reach_from(problem.goal)[moving]
     values = torch.linalg.eigvals(A)

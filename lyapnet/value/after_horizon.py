@@ -10,6 +10,7 @@ from torch import Tensor
 from lyapnet.base.errors import DivergenceError, one_line
 from lyapnet.base.types import PerState, State
 from lyapnet.task.problem import Problem
+from lyapnet.task.systems import moving_states
 
 LAWS = {  # laws that can follow T, in order of preference
     "riccati": "the linear-quadratic regulator of the goal, for an infinite horizon",
@@ -91,8 +92,7 @@ def is_held(problem: Problem, x: State) -> Bool[Tensor, " batch"]:
 
 def distance_to_goal(problem: Problem, x: State) -> PerState:
     """‖x − x*‖ in the states that the cost weighs."""
-    n = problem.system.n
-    weighed = [i for i in range(n) if i not in problem.system.constants and not problem.cost.ignores(i, n)]
+    weighed = [i for i in moving_states(problem.system) if not problem.cost.ignores(i, problem.system.n)]
     return torch.linalg.vector_norm(problem.cost.from_goal(x)[..., weighed], dim=-1)
 
 

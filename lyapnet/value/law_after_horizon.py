@@ -59,6 +59,11 @@ class LawAfterHorizon(nn.Module):
         assert self._beyond is not None
         return self._beyond
 
+    def state_within(self, x: State, late: Tensor) -> State:
+        """The state at which V and its law are evaluated, where the horizon begins anew at each step."""
+        again = self.problem.system.recurring(x) if self.beyond == "receding" else x
+        return x if again is x else torch.where(late[..., None], again, x)
+
     def note_once(self) -> None:
         """Log once which law follows T, if it was chosen automatically."""
         if not self._noted:
@@ -93,7 +98,8 @@ class ContinuedValue(ValueFunction):
     def at_any_time(self, t: Time, x: State) -> PerState:
         """The same without branches on t, for tracing."""
         beyond, late = self.sequel.beyond, is_after(t, self.sequel.duration)
-        value, regulator = self.V(_time_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
+        t, x = _time_within(t, late, self.sequel.duration, beyond), self.sequel.state_within(x, late)
+        value, regulator = self.V(t, x), self.sequel.regulator
         return value if regulator is None else torch.where(late, regulator.cost(x), value)
 
 
@@ -138,7 +144,8 @@ class ContinuedPolicy(ValuePolicy):
     def at_any_time(self, t: Time, x: State) -> Control:
         """The same without branches on t, for tracing; does not log the law after T."""
         beyond, late = self.beyond, is_at_end(t, self.sequel.duration)
-        u, regulator = self.policy(_time_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
+        t, x = _time_within(t, late, self.sequel.duration, beyond), self.sequel.state_within(x, late)
+        u, regulator = self.policy(t, x), self.sequel.regulator
         return u if regulator is None else torch.where(late[..., None], regulator(x), u)
 
 

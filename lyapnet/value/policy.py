@@ -11,7 +11,7 @@ from lyapnet.base.linear_algebra import apply, convex_or, multiply
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.task.cost import Cost
 from lyapnet.task.problem import Problem, Response
-from lyapnet.task.sets import ControlSet
+from lyapnet.task.sets import ControlSet, about_control
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.value.derivatives import jacobian
@@ -65,11 +65,12 @@ class HJBPolicy(ValuePolicy):
 
     def _minimise(self, x: State, V_x: State) -> Control:
         b = input_lie_derivative(self.system, x, V_x)
+        rest = self.cost.rest_at(x)
         if self.controls.limited:
             R = self.cost.R(x)
-            return self.controls.minimise(R, self.cost.about_rest(R, b))
+            return self.controls.minimise(R, about_control(R, b, rest))
         u = -0.5 * self.cost.solve_R(x, b)  # a constant R is inverted only once
-        return u if self.cost.rest is None else u + self.cost.rest
+        return u if rest is None else u + rest
 
 
 class SontagPolicy(ValuePolicy):
@@ -103,9 +104,9 @@ class SontagPolicy(ValuePolicy):
         V_t, V_x = gradients(self.V, t, x)
         LgV = input_lie_derivative(self.system, x, V_x)
         direction = self.cost.solve_R(x, LgV)
-        a = V_t + drift_lie_derivative(self.system, x, V_x)
-        if self.cost.rest is not None:
-            a = a + (LgV * self.cost.rest).sum(-1)
+        a, rest = V_t + drift_lie_derivative(self.system, x, V_x), self.cost.rest_at(x)
+        if rest is not None:
+            a = a + (LgV * rest).sum(-1)
         q = self.cost.state(x)
         sigma = (LgV * direction).sum(-1)
         # √ has no derivative at 0, its value at the goal: keep the argument positive
@@ -116,7 +117,7 @@ class SontagPolicy(ValuePolicy):
         gain_rising = (a + root) / torch.where(falling | (sigma <= 0), 1.0, sigma)
         gain = torch.where(falling, gain_falling, torch.where(sigma > 0, gain_rising, 0.0))
         u = -gain[..., None] * direction
-        return u if self.cost.rest is None else u + self.cost.rest
+        return u if rest is None else u + rest
 
 
 class SampledPolicy(ValuePolicy):

@@ -1,6 +1,5 @@
 """The infinite-horizon linear-quadratic regulator at a problem's goal; for a family, one for each member."""
 
-import itertools
 import operator
 from functools import reduce
 from typing import NamedTuple
@@ -10,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.base.interpolation import ChebyshevProducts
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, Matrix, PerState, State
 from lyapnet.task.cost.base import quadratic_form
@@ -48,7 +48,7 @@ class Regulator(nn.Module):
     """
 
     problem: Problem
-    basis: "_ChebyshevBasis | None"  # for a family
+    basis: ChebyshevProducts | None  # for a family
     P: Matrix  # for a family the coefficients of Chebyshev polynomials, (nodes, n + k, n + k)
     K: Float[Tensor, "m n"]  # likewise
 
@@ -58,7 +58,7 @@ class Regulator(nn.Module):
         super().__init__()
         self.problem, exact = problem, in_float64(problem)
         solve = _Solver(exact, purpose, instead, spread)
-        basis = _ChebyshevBasis(exact) if exact.system.constants else None
+        basis = _basis_of(exact) if exact.system.constants else None
         P, K = solve(exact.goal) if basis is None else _fit(basis, exact, solve)
         self.basis = None if basis is None else basis.to(problem.goal)
         self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
@@ -69,15 +69,20 @@ class Regulator(nn.Module):
         if self.basis is None:
             feedback = apply(self.K, offset)
         else:
-            feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(self.basis(x), self.K, strict=True)])
-        return self.problem.controls.project(self.problem.rest - feedback)
+            products = self.basis(self._parameters_of(x))
+            feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(products, self.K, strict=True)])
+        return self.problem.controls.project(self.problem.rest_at(x) - feedback)
 
     def cost(self, x: State) -> PerState:
         """The cost to go without control limits."""
         offset = self.problem.cost.from_goal(x)
         if self.basis is None:
             return quadratic_form(self.P, offset)
-        return _sum([b * quadratic_form(P, offset) for b, P in zip(self.basis(x), self.P, strict=True)])
+        products = self.basis(self._parameters_of(x))
+        return _sum([b * quadratic_form(P, offset) for b, P in zip(products, self.P, strict=True)])
+
+    def _parameters_of(self, x: State) -> Tensor:
+        return x[..., list(self.problem.system.constants)]
 
 
 class _Solver:
@@ -87,7 +92,7 @@ class _Solver:
         self.exact, self.purpose, self.instead, self.spread = exact, purpose, instead, spread
 
     def __call__(self, goal: State) -> Gains:
-        exact, u = self.exact, self.exact.rest
+        exact, u = self.exact, self.exact.rest_at(goal)
         if float(exact.system.dynamics(goal, u).abs().max()) > EQUILIBRIUM_TOLERANCE:
             raise ValueError(f"Expected a goal that is an equilibrium for {self.purpose}, got another; {self.instead}.")
         jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian
@@ -133,41 +138,14 @@ def _stabilising_gains(
     return Gains(embedding.T @ P @ embedding, K @ embedding)
 
 
-class _ChebyshevBasis(nn.Module):
-    """Products of Chebyshev polynomials of a family's parameters, each scaled to its range and clamped to it."""
-
-    center: Float[Tensor, " k"]
-    half_widths: Float[Tensor, " k"]
-
-    def __init__(self, exact: Problem):
-        super().__init__()
-        box, constants = exact.initial_states, list(exact.system.constants)
-        half = box.widths[constants] / 2
-        self.constants: list[int] = constants
-        self.counts: list[int] = [NODES if float(h) > 0 else 1 for h in half]
-        like = exact.goal
-        self.register_buffer("center", box.center[constants].to(like), persistent=False)
-        self.register_buffer("half_widths", torch.where(half > 0, half, 1.0).to(like), persistent=False)
-
-    def forward(self, x: State) -> list[PerState]:
-        """The products at the parameters of states (*batch, n + k)."""
-        axes = []
-        for k, (i, count) in enumerate(zip(self.constants, self.counts, strict=True)):
-            s = ((x[..., i] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
-            terms = [torch.ones_like(s), s]
-            while len(terms) < count:
-                terms.append(2 * s * terms[-1] - terms[-2])
-            axes.append(terms[:count])
-        return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
-
-    def nodes(self) -> Float[Tensor, "nodes k"]:
-        """The Chebyshev nodes, parameters at which the gains are interpolated; as many as products."""
-        angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.counts]
-        scaled = torch.cartesian_prod(*(a.cos() for a in angles)).reshape(-1, len(angles))
-        return self.center + self.half_widths * scaled
+def _basis_of(exact: Problem) -> ChebyshevProducts:
+    """Chebyshev polynomials of the parameters of a family."""
+    box, constants = exact.initial_states, list(exact.system.constants)
+    low, high = box.lower[constants], box.upper[constants]
+    return ChebyshevProducts(low, high, [NODES if w > 0 else 1 for w in (high - low).tolist()])
 
 
-def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
+def _fit(basis: ChebyshevProducts, exact: Problem, solve: _Solver) -> Gains:
     """Interpolate the gains of a family at the nodes, and check the result at random members between them.
 
     Raises:
@@ -176,17 +154,15 @@ def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
     nodes = basis.nodes()
     if len(nodes) > MOST_NODES:
         raise ValueError(
-            f"Expected a family of three parameters at most for {solve.purpose}, got {len(basis.constants)}; take "
+            f"Expected a family of three parameters at most for {solve.purpose}, got {len(basis.counts)}; take "
             f"one member, or {solve.instead}."
         )
-    between = exact.initial_states.sample(8, torch.Generator().manual_seed(0))[:, basis.constants]
+    between = exact.initial_states.sample(8, torch.Generator().manual_seed(0))[:, list(exact.system.constants)]
     at_nodes, at_others = ([solve(_goal_of(exact, p)) for p in some] for some in (nodes, between))
-    matrix, others = (
-        np.asarray(torch.stack(basis(torch.stack([_goal_of(exact, p) for p in some])), -1)) for some in (nodes, between)
-    )
+    others = np.asarray(torch.stack(basis(between), -1))
     coefficients = []
     for known, expected in zip(zip(*at_nodes, strict=True), zip(*at_others, strict=True), strict=True):
-        found = np.tensordot(np.linalg.inv(matrix), np.stack(known), 1)
+        found = basis.coefficients(torch.from_numpy(np.stack(known))).numpy()
         error = np.abs(np.tensordot(others, found, 1) - np.stack(expected)).max() / np.abs(expected).max()
         if error > INTERPOLATION_TOLERANCE:
             raise ValueError(

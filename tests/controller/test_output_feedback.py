@@ -203,3 +203,49 @@ def test_estimated_parameters_stay_in_their_ranges():
         feedback.step(torch.randn(200, 1, generator=generator).double())
     assert feedback.x_hat[:, 2].min() == 0.5
     assert feedback.x_hat[:, 2].max() == 1.5
+
+
+SETPOINTS = {"family": {"target_angle": [-0.5, 0.5]}, "controls": {"lower": -20, "upper": 20}}
+
+
+def test_a_setpoint_is_told_and_begins_the_horizon_anew():
+    controller = controller_of(**SETPOINTS)
+    feedback = controller.with_estimator(noise=1e-5)
+    u = [feedback.step([0.3], target_angle=0.2), *(feedback.step([0.3]) for _ in range(3))]
+    assert_close(feedback.x_hat[2], np.float64(0.2))
+    assert_close(feedback.P[2], np.zeros(3))
+    for k, each in enumerate(u[-1:], 3):
+        assert_close(each, controller.policy(k * 0.05, feedback.x_hat), rtol=1e-4, atol=1e-4)
+    changed = feedback.step([0.3], target_angle=-0.4)
+    at_start, later = (controller.policy(t, feedback.x_hat) for t in (0.0, 0.2))
+    assert_close(changed, at_start, rtol=1e-4, atol=1e-4)
+    assert abs(at_start - later) > 1e-3  # the clock matters
+    assert feedback.t == pytest.approx(0.2)
+    feedback.step([0.3], target_angle=-0.4)  # the same again: the horizon goes on
+    assert_close(feedback.step([0.3]), controller.policy(0.1, feedback.x_hat), rtol=1e-4, atol=1e-4)
+
+
+def test_each_loop_of_a_batch_has_its_own_setpoint():
+    controller, y = controller_of(**SETPOINTS), torch.full((3, 1), 0.1)
+    goals = torch.tensor([-0.5, 0.0, 0.4])
+    together = controller.with_estimator().step(y, target_angle=goals)
+    for k in range(3):
+        assert_close(controller.with_estimator().step(y[k], target_angle=float(goals[k])), together[k])
+    assert together.unique().numel() == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"target_angel": 0.1}, "settings among target_angle, got 'target_angel'"),
+        ({"target_angle": 0.6}, "target_angle from -0.5 to 0.5"),
+        ({"target_angle": math.nan}, "target_angle from -0.5 to 0.5"),
+        ({"target_angle": [0.1, 0.2]}, "target_angle as a number"),
+    ],
+)
+def test_settings_that_do_not_exist_are_refused(settings, reason):
+    feedback = controller_of(**SETPOINTS).with_estimator()
+    with pytest.raises(ValueError, match=reason):
+        feedback.step([0.1], **settings)
+    with pytest.raises(ValueError, match="settings among none"):
+        controller_of().with_estimator().step([0.1], **settings)

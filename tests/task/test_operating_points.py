@@ -262,7 +262,6 @@ def test_what_cannot_be_trimmed_is_refused_in_a_line(capsys, tmp_path, changes, 
     ("changes", "reason"),
     [
         ({"target": {"output voltage": 15}, "target_control": [0]}, "every state with target_control, got none for"),
-        ({"target": {"output voltage": 15}, "family": {"scale": [1, 2]}}, "every state with a family"),
         ({"target": None, "target_control": [0]}, "target with target_control, got none"),
         ({"target": [1, 15], "target_control": [math.inf]}, "target_control of finite numbers"),
     ],

@@ -213,7 +213,8 @@ def _header(controller: Controller, law: Law, style: Style, loop: Any) -> str:
     if "p" in law.arguments:
         sizes["PARAMETERS"] = len(law.arguments["p"])
     if loop is not None:
-        sizes["READINGS"], sizes["ESTIMATED"] = loop.readings, loop.estimated
+        sizes |= {"READINGS": loop.readings, "ESTIMATED": loop.estimated}
+        sizes |= {"SETTINGS": loop.settings} if loop.settings else {}
     numbers = {"DT": literal(controller.horizon.dt), "T": literal(controller.horizon.duration)}
     numbers |= {"X0_LOWER": numbers_of(box.lower[:n]), "X0_UPPER": numbers_of(box.upper[:n])}
     if (limits := limits_of(controller, style)) is not None and all(bool(side.isfinite().all()) for side in limits):

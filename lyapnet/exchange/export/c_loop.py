@@ -4,6 +4,7 @@ import copy
 import ctypes
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch.fx import GraphModule
 
 from lyapnet.base.errors import ExportError
 from lyapnet.base.random_streams import OUTPUTS, TEST, stream
-from lyapnet.controller.output_feedback import OutputFeedback
+from lyapnet.controller.output_feedback import ROUNDING, OutputFeedback
 from lyapnet.exchange.export.c import Style, box_table, has_limits, numbers_of
 from lyapnet.exchange.export.verification import AFTER, STATES, LoopAgreement, Points, tolerance_of
 from lyapnet.graphs.c_functions import c_function
@@ -49,6 +50,7 @@ class LoopTraces:
             )
         self.loop, problem = loop, loop.problem
         self.readings, self.estimated, self.controls = loop.outputs.count, problem.system.n, problem.system.m
+        self.settings = len(loop.settings)
         x, P = problem.initial_states.center, torch.diag(loop.deviation.square())
         u, y, t = problem.rest.double(), loop.outputs(x), torch.zeros((), dtype=torch.float64)
         law, like = loop.law, loop.state_of_law
@@ -84,7 +86,8 @@ class LoopTraces:
             f"{name} ± {noise:g} {unit}".rstrip()
             for name, noise, unit in zip(outputs.names, outputs.noise.tolist(), outputs.units, strict=True)
         )
-        return {"y": readings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind}
+        settings = {"r": ", ".join(self.loop.settings)} if self.settings else {}
+        return {"y": readings, **settings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind}
 
     def functions(self, tables: Tables) -> tuple[str, int]:
         """The text of the traced functions, and how many numbers a step has on the stack if they become parts of it."""
@@ -100,15 +103,19 @@ class LoopTraces:
         """The loop's type and functions for the header."""
         name, macro, real = style.name, style.macro, style.real
         n = f"{macro}_ESTIMATED"
+        settings = f" const {real} r[{macro}_SETTINGS]," if self.settings else ""
         return (
             f"/* A loop. After {name}_reset other estimates may be written to x and P, and a first time to start. */\n"
             f"typedef struct {{\n    {real} x[{n}];  /* the estimate after the last readings */\n"
             f"    {real} P[{n} * {n}];  /* its covariance, by rows */\n"
             f"    {real} u[{macro}_CONTROLS];  /* the control that acts until the next readings */\n"
             f"    {real} t;  /* s, of the last readings */\n    {real} start;  /* s, of the first ones */\n"
-            f"    unsigned long calls;\n}} {name}_loop;\n\nvoid {name}_reset({name}_loop *loop);\n\n"
-            f"/* u after readings y at loop->t, once in each {macro}_DT; NaN is a reading that is missing. */\n"
-            f"int {name}_step({name}_loop *loop, const {real} y[{macro}_READINGS], {real} u[{macro}_CONTROLS]);\n\n"
+            f"    unsigned long calls, begun;  /* steps so far, and at the last change of r */\n"
+            f"}} {name}_loop;\n\nvoid {name}_reset({name}_loop *loop);\n\n"
+            f"/* u after readings y at loop->t, once in each {macro}_DT; NaN is a reading that is missing."
+            f"{SETTINGS_SAY if self.settings else ''} */\n"
+            f"int {name}_step({name}_loop *loop, const {real} y[{macro}_READINGS],{settings} "
+            f"{real} u[{macro}_CONTROLS]);\n\n"
             "/* The control that the plant got since the last step, if it is not the one returned. */\n"
             f"int {name}_applied({name}_loop *loop, const {real} u[{macro}_CONTROLS]);\n\n"
         )
@@ -126,22 +133,34 @@ class LoopTraces:
             tables.append(box_table("domain_of_estimates", *domain.narrowed(-SLACK)))
             size = len(domain.lower)  # further estimates, of what the law is not told, have none
             checks.append(f"if (!is_inside({size}, loop->x, domain_of_estimates)) code |= {macro}_OUTSIDE_DOMAIN;")
+        which = list(loop.settings.values())
+        change = CHANGE.replace("@K", str(len(which))).replace("@WHICH", ", ".join(map(str, which)))
+        if which:
+            room = ROUNDING * torch.maximum(box.lower.abs(), box.upper.abs())[which]
+            tables.append(box_table("ranges", box.lower[which] - room, box.upper[which] + room))
         words = {
+            "SETTINGS": change if which else "",
+            "R": f"const double r[{len(which)}], " if which else "",
             "NAME": name, "MACRO": macro, "N": n, "M": m, "P": p, "KNOWN": known, "FIRST": ", ".join(members),
             "TRUSTED": literal(TRUSTED), "DT": problem.horizon.dt.hex(), "CHECKS": "\n    ".join(checks),
             "LIMIT": "limit(next);" if has_limits(problem.controls, style) else "",
         }  # fmt: skip
-        return "\n".join([*tables, re.sub(r"@([A-Z]+)", lambda word: str(words[word[1]]), LOOP)])
+        fill = partial(re.sub, r"@([A-Z]+)", lambda word: str(words[word[1]]))
+        return "\n".join([*tables, fill(fill(LOOP))])
 
     def example(self, style: Style) -> str:
         """A program that gives the loop the readings of its first estimate, for five steps."""
         name, macro, real = style.name, style.macro, style.real
-        y = numbers_of(self.loop.outputs(self.loop.problem.initial_states.center))
+        centre = self.loop.problem.initial_states.center
+        y, settings = numbers_of(self.loop.outputs(centre)), "r, " if self.settings else ""
+        r = numbers_of(centre[list(self.loop.settings.values())])
+        declared = f"    const {real} r[{macro}_SETTINGS] = {r};\n" if self.settings else ""
         return (
             '#include <stdio.h>\n#include "policy.h"\n\nint main(void)\n{\n'
-            f"    const {real} y[{macro}_READINGS] = {y};\n    {real} u[{macro}_CONTROLS];\n    {name}_loop loop;\n"
+            f"    const {real} y[{macro}_READINGS] = {y};\n{declared}    {real} u[{macro}_CONTROLS];\n"
+            f"    {name}_loop loop;\n"
             f"    {name}_reset(&loop);\n    for (int k = 0; k < 5; k++) {{\n"
-            f"        int code = {name}_step(&loop, y, u);\n"
+            f"        int code = {name}_step(&loop, y, {settings}u);\n"
             f'        for (int i = 0; i < {macro}_CONTROLS; i++) printf("u[%d] = %g\\n", i, u[i]);\n'
             '        if (code) printf("code %d\\n", code);\n    }\n    return 0;\n}\n'
         )
@@ -160,7 +179,7 @@ static int keep(@NAME_loop *loop, const double *x, const double *P)
 
 void @NAME_reset(@NAME_loop *loop)
 {
-    static const @NAME_loop first = {@FIRST, 0.0, 0.0, 0};
+    static const @NAME_loop first = {@FIRST, 0.0, 0.0, 0, 0};
     *loop = first;
 }
 
@@ -171,7 +190,7 @@ int @NAME_applied(@NAME_loop *loop, const double u[@M])
     return 0;
 }
 
-int @NAME_step(@NAME_loop *loop, const double y[@P], double u[@M])
+int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
 {
     double x[@N], P[@N * @N], known_y[@P], next[@M];
     int code = 0;
@@ -183,11 +202,13 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], double u[@M])
         predict_of(loop->x, loop->P, loop->u, x, P);
         code |= keep(loop, x, P);
     }
-    loop->t = (double)((WIDE)loop->start + (WIDE)loop->calls * @DT);
-    if (loop->calls + 1 > 0) loop->calls++;
+    unsigned long k = loop->calls;
+    loop->t = (double)((WIDE)loop->start + (WIDE)k * @DT);
+    if (k + 1 > 0) loop->calls++;
     correct_of(loop->x, loop->P, known_y, x, P);
     code |= keep(loop, x, P);
-    feedback_of(&loop->t, loop->x, next);
+@SETTINGS    double clock = loop->begun > 0 ? (double)((WIDE)(k - loop->begun) * @DT) : loop->t;
+    feedback_of(&clock, loop->x, next);
     @LIMIT
     if (is_finite(@M, next))
         for (int i = 0; i < @M; i++) loop->u[i] = next[i];
@@ -202,6 +223,20 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], double u[@M])
     return code;
 }
 """
+
+
+CHANGE = """    static const int which[@K] = {@WHICH};
+    for (int i = 0; i < @K; i++) {
+        if (isnan(r[i]) || (r[i] <= loop->x[which[i]] && r[i] >= loop->x[which[i]])) continue;
+        if (is_inside(1, r + i, ranges + i)) {
+            loop->x[which[i]] = r[i];
+            loop->begun = k;
+        } else
+            code |= @MACRO_OUTSIDE;
+    }
+"""
+SETTINGS_SAY = """
+   r: where one changes the horizon begins anew; if NaN or outside of its range it stays, at first in the middle."""
 
 
 class CompiledLoop:
@@ -220,15 +255,16 @@ class CompiledLoop:
         class Memory(ctypes.Structure):
             _fields_ = [
                 ("x", number * n), ("P", number * (n * n)), ("u", number * m), ("t", number), ("start", number),
-                ("calls", ctypes.c_ulong),
+                ("calls", ctypes.c_ulong), ("begun", ctypes.c_ulong),
             ]  # fmt: skip
 
-        self.memory, self._controls = Memory(), m
+        self.memory, self._controls, self._settings = Memory(), m, traces.settings
         self._reset, self._step, self._applied = (
             functions[f"{style.name}_{what}"] for what in ("reset", "step", "applied")
         )
         self._reset.argtypes, self._reset.restype = [ctypes.c_void_p], None
-        self._step.argtypes, self._step.restype = [ctypes.c_void_p] * 3, ctypes.c_int
+        self._step.argtypes = [ctypes.c_void_p] * (4 if traces.settings else 3)
+        self._step.restype = ctypes.c_int
         self._applied.argtypes, self._applied.restype = [ctypes.c_void_p] * 2, ctypes.c_int
         self.code = 0  # what the last step returned
         self.reset()
@@ -237,13 +273,15 @@ class CompiledLoop:
         """Begin again."""
         self._reset(ctypes.addressof(self.memory))
 
-    def step(self, y: NDArray, applied: NDArray | None = None) -> NDArray:
-        """u (m,) after readings y (p,), as OutputFeedback.step."""
+    def step(self, y: NDArray, applied: NDArray | None = None, r: NDArray | None = None) -> NDArray:
+        """u (m,) after readings y (p,), as OutputFeedback.step; r, the settings of a family, NaN to leave them."""
         if applied is not None:
             given = np.ascontiguousarray(applied, self._style.numpy)
             self._applied(ctypes.addressof(self.memory), given.ctypes.data)
         readings, u = np.ascontiguousarray(y, self._style.numpy), np.empty(self._controls, self._style.numpy)
-        self.code = self._step(ctypes.addressof(self.memory), readings.ctypes.data, u.ctypes.data)
+        given = [np.full(self._settings, np.nan) if r is None else r] if self._settings else []
+        arrays = [readings, *(np.ascontiguousarray(each, self._style.numpy) for each in given), u]
+        self.code = self._step(ctypes.addressof(self.memory), *(each.ctypes.data for each in arrays))
         return u
 
     @property
@@ -262,6 +300,7 @@ class _Path(NamedTuple):
 
     y: Tensor
     applied: Tensor  # NaN where the loop's own control acted
+    r: Tensor  # settings of a family; NaN where they stayed
     u: Tensor
     x_hat: Tensor
     P: Tensor
@@ -285,7 +324,8 @@ def verify_loop(loop: OutputFeedback, found: CompiledLoop, dtype: torch.dtype) -
         found.reset()
         for step in range(int(finite[:, k].sum())):
             applied = path.applied[step, k]
-            u = found.step(path.y[step, k].numpy(), None if bool(applied.isnan().any()) else applied.numpy())
+            other = None if bool(applied.isnan().any()) else applied.numpy()
+            u = found.step(path.y[step, k].numpy(), other, path.r[step, k].numpy())
             for i, own in enumerate((u, found.x_hat, found.P)):
                 difference = np.abs(own - expected[i][step, k]) / scales[i]
                 worst[i] = max(worst[i], np.where(np.isnan(difference), np.inf, difference).max())
@@ -317,12 +357,19 @@ def _path_of(loop: OutputFeedback) -> _Path:
     problem, draw = loop.problem, stream(0, TEST, OUTPUTS)
     steps = min(STATES, max(2, round(AFTER * problem.horizon.steps)))
     x, other = problem.initial_states.sample(-(-STATES // steps), draw), None
-    rows = list[tuple[Tensor, ...]]()
+    rows, which = list[tuple[Tensor, ...]](), list(loop.settings.values())
     for _ in range(steps):
         y = loop.outputs.draw(x, draw)
         y = y.masked_fill(~y.isfinite() | (torch.rand(y.shape, generator=draw) < MISSING), torch.nan)
-        u = loop.step(y, applied=other).double().cpu()
-        rows.append((y, torch.full_like(u, torch.nan) if other is None else other, u, *loop.belief))
+        changed = bool(which) and float(torch.rand((), generator=draw)) < ELSEWHERE
+        r = (
+            problem.initial_states.sample(len(x), draw)[:, which]
+            if changed
+            else torch.full((len(x), len(which)), torch.nan)
+        )
+        settings = dict(zip(loop.settings, r.unbind(-1), strict=True)) if changed else {}
+        u = loop.step(y, applied=other, **settings).double().cpu()
+        rows.append((y, torch.full_like(u, torch.nan) if other is None else other, r, u, *loop.belief))
         replaced = float(torch.rand((), generator=draw)) < ELSEWHERE and bool(u.isfinite().all())
         other = problem.controls.project(0.9 * u) if replaced else None
         x = problem.step(x, u if other is None else other)[0]

@@ -38,7 +38,7 @@ class Variable(NamedTuple):
 
 
 def variables_of(controller: Controller, law: Law, loop: LoopTraces | None) -> list[Variable]:
-    """Inputs x, or readings y of a loop; the parameters of a family, which can be set between steps; outputs u.
+    """Inputs x, with parameters of a family to be set between steps; or a loop's readings and settings. Outputs u.
 
     Their value references are their places in this list, from 1 on; 0 is time, and the last one the code.
     """
@@ -51,6 +51,8 @@ def variables_of(controller: Controller, law: Law, loop: LoopTraces | None) -> l
         outputs = loop.loop.outputs
         first = outputs(loop.loop.problem.initial_states.center).tolist()
         given = [(*each, "input", at) for *each, at in zip(outputs.names, outputs.units, first, strict=True)]
+        of = list(loop.loop.settings.values())
+        given += [(system.state_names[i], system.state_units[i], "input", centre[i]) for i in of]
     given += [
         (name, unit, "output", None) for name, unit in zip(system.control_names, system.control_units, strict=True)
     ]
@@ -73,7 +75,7 @@ def _identifier(name: str, otherwise: str, taken: set[str]) -> str:
 
 def write_fmu(
     path: Path, version: str, sources: Mapping[str, str], variables: Sequence[Variable], style: Style,
-    controller: Controller, looped: bool, draft: Path,
+    controller: Controller, looped: bool, settings: int, draft: Path,
 ) -> None:  # fmt: skip
     """Write a unit: its description, its source, and a binary for this machine where the standard has a place for it.
 
@@ -83,12 +85,13 @@ def write_fmu(
         variables: as of variables_of.
         style: the names and the precision of the sources.
         looped: whether the sources have a loop, whose inputs are readings.
+        settings: how many of the last inputs are settings of a family.
         draft: an empty folder.
 
     Raises:
         ExportError: the compiler refuses it.
     """
-    text = _adapter(version, variables, style, looped, controller.horizon.dt)
+    text = _adapter(version, variables, style, looped, settings, controller.horizon.dt)
     token = hashlib.sha256((text + sources["policy.c"]).encode()).hexdigest()[:32]
     files = {
         "policy.h": sources["policy.h"], "policy.c": sources["policy.c"], "fmu.c": text.replace("@TOKEN", token),
@@ -208,7 +211,7 @@ def _build_description(name: str) -> str:
     )
 
 
-def _adapter(version: str, variables: Sequence[Variable], style: Style, looped: bool, dt: float) -> str:
+def _adapter(version: str, variables: Sequence[Variable], style: Style, looped: bool, settings: int, dt: float) -> str:
     """fmu.c: what the standard asks for, around policy.c."""
     given = [each for each in variables if each.causality != "output"]
     inputs = sum(each.causality == "input" for each in given)
@@ -216,7 +219,7 @@ def _adapter(version: str, variables: Sequence[Variable], style: Style, looped: 
     start = ", ".join(repr(float(each.start or 0.0)) for each in given)
     if looped:
         memory, reset = f"    {style.name}_loop loop;\n", f"    {style.name}_reset(&unit->loop);\n"
-        call = f"{style.name}_step(&unit->loop, x, u)"
+        call = f"{style.name}_step(&unit->loop, x, {f'x + {inputs - settings}, ' if settings else ''}u)"
     else:
         memory, reset = "", ""
         call = f"{style.name}_control(({style.real})((double)unit->samples * DT), x{parameter}, u)"

@@ -208,7 +208,7 @@ def _write_fmu(written: _Written, draft: Path, path: Path, version: str) -> Expo
     _, agreement = written.verified(draft, c.FLAGS)
     variables = fmu.variables_of(written.controller, written.law, written.traces)
     sources, file = written.sources(verified=str(agreement)), draft / path.name
-    looped = written.traces is not None
-    fmu.write_fmu(file, version, sources, variables, written.style, written.controller, looped, draft)
+    looped, settings = written.traces is not None, 0 if written.traces is None else written.traces.settings
+    fmu.write_fmu(file, version, sources, variables, written.style, written.controller, looped, settings, draft)
     write_atomically(path, file.read_bytes())
     return Exported([path], agreement)

@@ -3,20 +3,19 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.types import ControlMatrix, State
 from lyapnet.experiment.assembly.classes import Parts, section
-from lyapnet.experiment.assembly.target import about_written_target, holding, written_target
+from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
 from lyapnet.experiment.config import Config
 from lyapnet.task.cost import Cost, MadeOfAnother, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
-from lyapnet.task.operating_points import HELD
+from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -31,26 +30,17 @@ def family_of(
 
     Raises:
         UsageError: a name is neither a parameter of the system nor target_STATE, a range is invalid, a member breaks
-            the contract of FamilySystem, or targets are held by different controls.
+            the contract of FamilySystem, or no control holds the target of a member.
     """
     if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
     ranges = checked_ranges(config.family, "family")
-    targets = _target_indices(ranges, system)
-    units = [system.state_units[targets[name]] if name in targets else "" for name in ranges]
+    of_states, moved = _target_indices(ranges, system), _moved_states(ranges, system)
+    units = [system.state_units[of_states[name]] if name in of_states else "" for name in ranges]
     family, box = members_of(config, system, ranges, units, initial_states)
-    low, high = box.lower[system.n :], box.upper[system.n :]
-    center = (low + high) / 2
-    shift = torch.zeros(system.n, len(ranges), dtype=torch.float64)
-    for k, name in enumerate(ranges):
-        if name in targets:
-            shift[targets[name], k] = 1
-    if targets or config.target is not None:
-        at_center = _config_of(config, dict(zip(ranges, center.tolist(), strict=True)), system)
-        cost = about_written_target(at_center, cost, family.member(center), controls)
-        if config.target_control is None:
-            _require_one_control(family, cost, shift, center, low, high)
-    return family, FamilyCost(cost, shift, center, _weight_of_members(cost, family)), box
+    center = box.center[system.n :]
+    cost, targets = cost_and_targets(config, cost, family, controls, box, moved)
+    return family, FamilyCost(cost, targets, center, system.n, _weight_of_members(cost, family)), box
 
 
 def members_of(
@@ -74,9 +64,12 @@ def members_of(
 
 
 def member(
-    config: Config, parts: Parts, family: FamilySystem, parameters: Mapping[str, Any]
+    config: Config, parts: Parts, problem: Problem, parameters: Mapping[str, Any]
 ) -> tuple[Config, Parts, list[float]]:
     """The config of a family's member, the user's parts for it, and its p in the order of the family.
+
+    Args:
+        problem: of the family.
 
     Raises:
         UsageError: a parameter is missing, unknown, no number, or outside the range that V was trained for.
@@ -92,20 +85,13 @@ def member(
             raise UsageError(f"Expected {name} as one number, got {parameters[name]!r}; name one member.") from error
         if not knows(config, name, values[name]):
             raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
+    family = problem.system
+    assert isinstance(family, FamilySystem)
     numbers = {name: values[name] for name in family.parameters_in_f}
-    own = dataclasses.replace(parts, system=with_attributes(family.system, numbers))
-    return _config_of(config, values, family.system), own, [*values.values()]
-
-
-def _config_of(config: Config, parameters: Mapping[str, float], system: ControlAffineSystem) -> Config:
-    """The config of a family's member."""
-    given = {name: value for name, value in parameters.items() if not name.startswith(PREFIX)}
-    own = dataclasses.replace(config.system, parameters={**config.system.parameters, **given})
-    target = None if config.target is None else written_target(config, system).tolist()
-    for name, i in _target_indices(parameters, system).items():
-        target = [0.0] * system.n if target is None else target
-        target[i] = parameters[name]
-    return dataclasses.replace(copy.deepcopy(config), system=own, target=target, family={})
+    system = dataclasses.replace(config.system, parameters={**config.system.parameters, **numbers})
+    target = target_of_member(config, problem, _moved_states(values, family.system), [*values.values()])
+    own = dataclasses.replace(copy.deepcopy(config), system=system, target=target, family={})
+    return own, dataclasses.replace(parts, system=with_attributes(family.system, numbers)), [*values.values()]
 
 
 def knows(config: Config, name: str, value: float) -> bool:
@@ -131,7 +117,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
     return dict(ranges)
 
 
-def _target_indices(names: Mapping[str, object], system: ControlAffineSystem) -> dict[str, int]:
+def _target_indices(names: Collection[str], system: ControlAffineSystem) -> dict[str, int]:
     """Name target_STATE ↦ index of the state."""
     known = {PREFIX + name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
     targets = [name for name in names if name.startswith(PREFIX)]
@@ -140,6 +126,11 @@ def _target_indices(names: Mapping[str, object], system: ControlAffineSystem) ->
             hint = did_you_mean(name, known, "name a state of the system.", "family.")
             raise UsageError(f"Expected family.{name} among {', '.join(known)}, got no such state; {hint}")
     return {name: known[name] for name in targets}
+
+
+def _moved_states(names: Collection[str], system: ControlAffineSystem) -> dict[int, int]:
+    """Index of a state ↦ index of the parameter that is its target."""
+    return {i: list(names).index(name) for name, i in _target_indices(names, system).items()}
 
 
 def _check_members(config: Config, family: FamilySystem, box: Box, key: str) -> None:
@@ -155,22 +146,6 @@ def _check_members(config: Config, family: FamilySystem, box: Box, key: str) -> 
     inside = box.sample(TEST_STATES, torch.Generator().manual_seed(0))
     states = torch.cat([box.lower[None], box.upper[None], inside])
     check_members(family, build, states, f"parameters of {key}")
-
-
-def _require_one_control(
-    family: FamilySystem, cost: Cost, shift: Tensor, center: Tensor, low: Tensor, high: Tensor
-) -> None:
-    """Raise UsageError unless all targets are held by the same control as the one at the centre."""
-    assert cost.goal is not None
-    assert cost.rest is not None
-    for p in (low, high, *Box(low, high).sample(TEST_STATES, torch.Generator().manual_seed(0))):
-        x = cost.goal + shift @ (p - center)
-        u = holding(family.member(p), x)
-        if not float((u - cost.rest).abs().max()) <= HELD * max(1.0, float(cost.rest.abs().max())):
-            raise UsageError(
-                f"Expected a family whose targets one control holds, got u = {cost.rest.tolist()} at its centre "
-                f"and {u.tolist()} at x = {x.tolist()}; say what the cost counts u from, as in target_control: [0]."
-            )
 
 
 def _weight_of_members(cost: Cost, family: FamilySystem) -> Callable[[State], ControlMatrix] | None:

@@ -14,6 +14,7 @@ from lyapnet.loop.estimation.kalman import initial_deviation, least_drift
 from lyapnet.task.input_disturbances import with_input_disturbances
 from lyapnet.task.outputs import MeasuredStates, Outputs, SystemOutput
 from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.systems import moving_states
 
 ASSUMED, DISTURBANCES = "outputs.process_noise", "outputs.input_disturbances"
 
@@ -95,9 +96,9 @@ def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
     Raises:
         UsageError: the length does not fit.
     """
-    deviation, system = initial_deviation(problem.initial_states), problem.system
+    deviation, system = initial_deviation(problem), problem.system
     if config.initial_deviation is not None:
-        moving = [name for i, name in enumerate(system.state_names) if i not in system.constants]
+        moving = [system.state_names[i] for i in moving_states(system)]
         given = repeated(config.initial_deviation, len(moving))
         require_length("outputs.initial_deviation", len(given), moving)
         deviation[: len(moving)] = deviation.new_tensor(given)

@@ -20,6 +20,7 @@ from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
 from lyapnet.experiment.assembly.noise import build_noise, check_risk
 from lyapnet.experiment.assembly.outputs import estimator_parts
+from lyapnet.experiment.assembly.reference import reference_of
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
@@ -72,8 +73,10 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
-        if config.family:
+        if config.family and not config.reference.points:
             system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
+        elif config.reference.points:
+            system, cost, initial_states = reference_of(config, system, cost, controls, initial_states)
         elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
             cost = about_target(config, cost, system, controls, initial_states)
         if not isinstance(parts.cost, MadeOfAnother):

@@ -13,7 +13,7 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.experiment.assembly.entries import repeated, require_length
 from lyapnet.experiment.config import Config, ConstraintsConfig
 from lyapnet.task.cost import Cost, TargetCost
-from lyapnet.task.operating_points import HELD, OperatingPoint, OperatingPoints
+from lyapnet.task.operating_points import OperatingPoint, OperatingPoints
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -33,23 +33,22 @@ def about_target(
     config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet, initial_states: Box
 ) -> Cost:
     """The cost with the target of a config, if there is one; a note reports components that were solved for."""
-    if config.target is None or config.target_control is not None:
+    if config.target_control is not None:
         return about_written_target(config, cost, system, controls)
+    if config.target is None:
+        return cost
     (x, u, *_), _, note = trim(config, system, controls, initial_states)
-    _log_once(note)
+    log_once(note)
     return TargetCost(cost, x, u)
 
 
 def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
-    """The cost with exactly the given x*, and the given u* or the u* that holds x*."""
-    if config.target is None and config.target_control is not None:
-        raise UsageError("Expected target with target_control, got none; name the state that it holds.")
+    """The cost with exactly the given x* and u*."""
     if config.target is None:
-        return cost
-    x = written_target(config, system)
-    u = holding(system, x) if config.target_control is None else _written_control(config, system)
+        raise UsageError("Expected target with target_control, got none; name the state that it holds.")
+    x, u = _written_target(config, system), _written_control(config, system)
     if not bool(controls.contains(u)):
-        raise _not_admitted_error(u)
+        raise not_admitted_error(u)
     return TargetCost(cost, x, u)
 
 
@@ -60,13 +59,13 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         UsageError: the target is invalid, or no admissible control holds it.
     """
     given = named_entries(config.target, system)
-    search = OperatingPoints(system, controls, initial_states, _state_limits(config.constraints, system))
+    search = OperatingPoints(system, controls, initial_states, state_limits(config.constraints, system))
     if len(given) == system.n:
         point = search.held_by(torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64))
         if not point.held:
             point, note = _move_to_nearest(search, given, point)
-            return Trim(_require_admitted(point), [], note)
-        return Trim(_require_admitted(point), [], "")
+            return Trim(require_admitted(point), [], note)
+        return Trim(require_admitted(point), [], "")
     points = search.find(given)
     if not points:
         raise UsageError(
@@ -76,7 +75,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
     point, *others = points
     if not point.held:
         point, note = _move_to_nearest(search, given, point)
-        return Trim(_require_admitted(point), [], note)
+        return Trim(require_admitted(point), [], note)
     note = f"{_format_entries(given, system)}; solved for {_format_point(point, system, given)}"
     if others:
         further = "; ".join(
@@ -85,7 +84,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         )
         more = f" and {len(others) - LISTED_POINTS} more" if len(others) > LISTED_POINTS else ""
         note += f", the nearest to X₀'s centre of {len(points)}; also {further}{more}"
-    return Trim(_require_admitted(point), others, f"target: {note}.")
+    return Trim(require_admitted(point), others, f"target: {note}.")
 
 
 def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
@@ -126,7 +125,7 @@ def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
     return found
 
 
-def written_target(config: Config, system: ControlAffineSystem) -> Tensor:
+def _written_target(config: Config, system: ControlAffineSystem) -> Tensor:
     """The target of a config, which has to give every state.
 
     Raises:
@@ -135,25 +134,10 @@ def written_target(config: Config, system: ControlAffineSystem) -> Tensor:
     given = named_entries(config.target, system)
     missing = [name for i, name in enumerate(system.state_names) if i not in given]
     if missing:
-        what = "with target_control" if config.target_control is not None else "with a family"
         raise UsageError(
-            f"Expected target with every state {what}, got none for {', '.join(missing)}; give them, as lyapnet trim "
-            "finds them where they are to be solved for."
+            f"Expected target with every state with target_control, got none for {', '.join(missing)}; give them."
         )
     return torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64)
-
-
-def holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
-    """u* with f(x*) + g(x*)u* = 0.
-
-    Raises:
-        UsageError: there is none.
-    """
-    u, left = system.holding_control(x)
-    worst = int(left.abs().argmax())
-    if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
-        raise _not_held_error(system, x, f"choose another, or {CONTROL_ADVICE}")
-    return u + 0.0  # turns −0 into 0
 
 
 def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:
@@ -181,10 +165,11 @@ def _move_to_nearest(
     advice = f"choose another, or {CONTROL_ADVICE}"
     if near is not None and near.admitted:
         advice = f"choose another, such as {_round_to_six_digits(near.x)}, or {CONTROL_ADVICE}"
-    raise _not_held_error(system, point.x, advice)
+    raise not_held_error(system, point.x, advice)
 
 
-def _not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
+def not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
+    """The error for a target that no control holds."""
     left = system.holding_control(x)[1]
     worst = int(left.abs().nan_to_num(torch.inf).argmax())
     return UsageError(
@@ -193,20 +178,22 @@ def _not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> Usag
     )
 
 
-def _require_admitted(point: OperatingPoint) -> OperatingPoint:
+def require_admitted(point: OperatingPoint) -> OperatingPoint:
+    """The point, if its state and control are within their limits; else raises a UsageError."""
     if not point.admitted:
-        raise _not_admitted_error(point.u)
+        raise not_admitted_error(point.u)
     return point
 
 
-def _not_admitted_error(u: Tensor) -> UsageError:
+def not_admitted_error(u: Tensor) -> UsageError:
+    """The error for a target whose control u* is beyond its limits."""
     return UsageError(
         f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
         "choose another target."
     )
 
 
-def _state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
+def state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
     """The state limits of a config, within which points are preferred; their names are checked elsewhere."""
     low, high = (
         torch.tensor([float(side.get(name, none)) for name in system.state_names], dtype=torch.float64)
@@ -231,7 +218,7 @@ def _round_to_six_digits(x: Tensor) -> list[float]:
 
 
 @functools.cache
-def _log_once(note: str) -> None:
+def log_once(note: str) -> None:
     """Log a note only once in a process, even if the problem is built several times."""
     if note:
         logging.getLogger(__name__).warning("note: %s", note)

@@ -18,7 +18,6 @@ from lyapnet.base.types import Control, State
 from lyapnet.task.domain import size_of
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
-from lyapnet.task.sets import Box
 from lyapnet.value.derivatives import jacobian_of
 
 Covariance = Float[Tensor, "*batch n n"]
@@ -153,14 +152,20 @@ class UnscentedKalmanFilter(KalmanFilter):
 FILTERS = {"ekf": ExtendedKalmanFilter, "ukf": UnscentedKalmanFilter}
 
 
-def initial_deviation(box: Box) -> Deviations:
-    """The standard deviation of a uniform distribution on X₀; of a state that X₀ fixes, KNOWN times its size."""
-    return (box.widths / math.sqrt(12)).where(box.widths > 0, KNOWN * size_of(box))
+def initial_deviation(problem: Problem) -> Deviations:
+    """The standard deviation of a uniform distribution on X₀; of a state that X₀ fixes, KNOWN times its size.
+
+    Settings, such as the targets of a family, are known exactly.
+    """
+    box = problem.initial_states
+    deviation = (box.widths / math.sqrt(12)).where(box.widths > 0, KNOWN * size_of(box))
+    deviation[list(problem.system.settings)] = 0.0
+    return deviation
 
 
 def least_drift(problem: Problem) -> Deviations:
     """A random walk that over the horizon comes to AWAKE times the initial uncertainty: it keeps the filter awake."""
-    return AWAKE * initial_deviation(problem.initial_states) / math.sqrt(problem.horizon.duration)
+    return AWAKE * initial_deviation(problem) / math.sqrt(problem.horizon.duration)
 
 
 def _without_missing(surprise: Readings) -> tuple[Readings, Tensor]:

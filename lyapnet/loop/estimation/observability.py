@@ -22,7 +22,7 @@ class Observability(NamedTuple):
     """
 
     rank: int  # least rank of W over the loops
-    condition: float  # largest ratio of the extreme eigenvalues of W; infinite if the rank is below n
+    condition: float  # largest ratio of the extreme eigenvalues of W; infinite if not all of x₀ is seen
     deviation: Deviations  # √P of each state after the last reading, root mean square over the loops
     of_first: Deviations  # the same without process noise: what is left of the uncertainty of x₀
 
@@ -33,13 +33,14 @@ def observability(
     """The observability along closed loops x (N + 1, b, n), u (N, b, m).
 
     Args:
-        deviation: standard deviation of each component of x₀ before any reading.
+        deviation: standard deviation of each component of x₀ before any reading; 0 for those that are known, which
+            do not count in rank and condition.
     """
     A = kalman.step_jacobian(x[:-1], u)
     H, Q = kalman.output_jacobian(x), kalman.process_noise(x[:-1])
     first = torch.diag(deviation)
     P, with_noise = first.expand(2, x.shape[1], -1, -1).square(), Q.new_tensor([1.0, 0.0])[:, None, None, None]
-    phi, seen = first.expand_as(P[0]), list[Tensor]()
+    phi, seen = first[:, deviation > 0].expand(x.shape[1], -1, -1), list[Tensor]()
     for k in range(len(x)):
         if k:
             phi, P = A[k - 1] @ phi, A[k - 1] @ P @ A[k - 1].mT + with_noise * Q[k - 1]
@@ -48,6 +49,6 @@ def observability(
     roots = torch.linalg.svdvals(torch.cat(seen, -2))  # of W, (b, n)
     rounding = torch.finfo(roots.dtype).eps * roots.shape[-1] * roots[:, :1]
     rank = (roots > rounding.clamp_min(SEEN)).sum(-1)
-    condition = (roots[:, 0] / roots[:, -1].where(rank == x.shape[-1], 0.0)).square()
+    condition = (roots[:, 0] / roots[:, -1].where(rank == roots.shape[-1], 0.0)).square()
     left = P.diagonal(dim1=-2, dim2=-1).mean(1).sqrt()
     return Observability(int(rank.min()), float(condition.max()), left[0], left[1])

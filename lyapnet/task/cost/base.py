@@ -26,7 +26,7 @@ class Cost(nn.Module, ABC):
     """
 
     goal: Float[Tensor, " n"] | None  # state at which q and φ vanish, if there is one; None: the origin
-    rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing; None: zero
+    rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing (at the goal, see rest_at); None: zero
     R_constant: Matrix | None  # R, if it is the same at every state
     R_inverse: Matrix | None  # its inverse
 
@@ -66,6 +66,10 @@ class Cost(nn.Module, ABC):
         """x − x*; in a family x* is the target of each member, and the parameters' entries are zero."""
         return x if self.goal is None else x - self.goal.to(x)
 
+    def rest_at(self, x: State) -> Tensor | None:
+        """u* at each state, (*batch, m) or (m,); in a family it is the u* of each member. None: zero."""
+        return self.rest
+
     def terminal_gradient(self, x: State) -> State:
         """φ_x(x), by automatic differentiation unless a subclass overrides it."""
         recording = torch.is_grad_enabled()
@@ -76,11 +80,8 @@ class Cost(nn.Module, ABC):
 
     def control(self, x: State, u: Control) -> PerState:
         """uᵀR(x)u, or (u − u*)ᵀR(x)(u − u*)."""
-        return quadratic_form(self.R(x), u if self.rest is None else u - self.rest)
-
-    def about_rest(self, R: ControlMatrix, b: Control) -> Control:
-        """b − 2Ru*, so that uᵀRu + (b − 2Ru*)ᵀu equals (u − u*)ᵀR(u − u*) + bᵀu up to a constant."""
-        return b if self.rest is None else b - 2 * apply(R, self.rest)
+        rest = self.rest_at(x)
+        return quadratic_form(self.R(x), u if rest is None else u - rest)
 
     def running(self, x: State, u: Control) -> PerState:
         """ℓ(x, u) = q(x) + uᵀR(x)u, in cost per second."""

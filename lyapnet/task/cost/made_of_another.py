@@ -37,6 +37,9 @@ class MadeOfAnother(Cost):
     def from_goal(self, x: State) -> State:
         return self.cost.from_goal(x)
 
+    def rest_at(self, x: State) -> Tensor | None:
+        return self.cost.rest_at(x)
+
     def ignores(self, i: int, n: int) -> bool:
         return self.cost.ignores(i, n)
 
@@ -66,6 +69,9 @@ class TargetCost(MadeOfAnother):
 
     def from_goal(self, x: State) -> State:
         return Cost.from_goal(self, x)
+
+    def rest_at(self, x: State) -> Tensor | None:
+        return self.rest
 
     def state(self, x: State) -> PerState:
         return self.cost.state(x - self.shift)

@@ -1,7 +1,7 @@
 """The registered systems. A new one is a subclass and one line in SYSTEMS, or `module:Class` in a config."""
 
 from lyapnet.task.systems.acrobot import Acrobot
-from lyapnet.task.systems.base import ControlAffineSystem, MechanicalSystem
+from lyapnet.task.systems.base import ControlAffineSystem, MechanicalSystem, moving_states
 from lyapnet.task.systems.cartpole import Cartpole
 from lyapnet.task.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
 from lyapnet.task.systems.path_tracking import PathTracking
@@ -48,4 +48,5 @@ __all__ = [
     "ThreeLinkArm",
     "VanDerPol",
     "is_linear",
+    "moving_states",
 ]

@@ -32,6 +32,7 @@ class ControlAffineSystem(nn.Module, ABC):
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
     constants: Sequence[int] = ()  # indices of constant states, the parameters of a family
+    settings: Sequence[int] = ()  # states that are told, as no reading tells them: targets, the time on a reference
 
     @abstractmethod
     def f(self, x: State) -> State:
@@ -44,6 +45,10 @@ class ControlAffineSystem(nn.Module, ABC):
     def dynamics(self, x: State, u: Control) -> State:
         """ẋ = f(x) + g(x)u."""
         return self.f(x) + apply(self.g(x), u)
+
+    def recurring(self, x: State) -> State:
+        """The same state, for a law that begins anew: the time on a periodic reference without whole periods."""
+        return x
 
     def holding_control(self, x: State) -> tuple[Control, State]:
         """The u that holds a state (n,), f(x) + g(x)u = 0, as the least squares solution of least norm; and its ẋ."""
@@ -114,7 +119,7 @@ class ControlAffineSystem(nn.Module, ABC):
                     f"Expected one unit for each of the {len(listed)} {name}.{names}, got {len(of_each)}; "
                     f"declare {units}."
                 )
-        for attribute in ("angles", "constants"):
+        for attribute in ("angles", "constants", "settings"):
             listed = getattr(self, attribute)
             if not all(isinstance(i, int) and 0 <= i < self.n for i in listed):
                 raise UsageError(f"Expected {name}.{attribute} as indices of states, got {listed!r}; count from 0.")
@@ -148,6 +153,11 @@ class ControlAffineSystem(nn.Module, ABC):
     def control_labels(self) -> list[str]:
         """Names with units, as in "force (N)"."""
         return _with_units(self.control_names, self.control_units)
+
+
+def moving_states(system: ControlAffineSystem) -> list[int]:
+    """The indices of the states that are neither parameters of a family nor told, as the time on a reference."""
+    return [i for i in range(system.n) if i not in system.constants and i not in system.settings]
 
 
 class MechanicalSystem(ControlAffineSystem):

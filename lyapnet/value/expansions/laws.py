@@ -9,6 +9,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, PerState, State, StatePath, ValuePath
 from lyapnet.task.problem import Problem, Response
+from lyapnet.task.sets import about_control
 from lyapnet.value.risk import equivalent_derivatives
 
 
@@ -63,9 +64,9 @@ def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Con
     weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
     if problem.controls.limited:
-        return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
+        return problem.controls.minimise(weight / 2, about_control(weight / 2, b, free.u))
     u = -solve(weight, b[..., None])[..., 0]
-    return u if problem.cost.rest is None else u + problem.cost.rest
+    return u if free.u is None else u + free.u
 
 
 def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
@@ -82,5 +83,4 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
 
 def at_rest(problem: Problem) -> Callable[[int, State], Control]:
     """The law (n, x_n) ↦ the control at rest, which costs nothing, projected onto U."""
-    u = problem.controls.project(problem.rest)
-    return lambda _, x: u.to(x).expand(*x.shape[:-1], -1)
+    return lambda _, x: problem.controls.project(problem.rest_at(x))

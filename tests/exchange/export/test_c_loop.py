@@ -89,6 +89,7 @@ def controller_of(beyond="riccati", parts=None, **changes):
     return lyapnet.Controller(problem, V, config=config, beyond=beyond, parts=parts)
 
 
+SWING = {"controls": {"lower": -20, "upper": 20}}
 LOOPS = {
     "a pendulum": lambda: controller_of().with_estimator(),
     "held after T": lambda: controller_of("hold").with_estimator(),
@@ -100,6 +101,8 @@ LOOPS = {
     "outputs of the system": lambda: controller_of(
         parts=Parts(system=Seen()), outputs={"noise": [0.01, 0.02]}
     ).with_estimator(),
+    "settings": lambda: controller_of("hold", family={"target_angle": [-0.4, 0.4], "length": [0.9, 1.1]}, **SWING)
+    .with_estimator(),
     "a domain": lambda: controller_of(parts=Parts(system=Tanks()), **TANKS).with_estimator(),
     "one state": lambda: controller_of(
         parts=Parts(system=Level()), cost={"Q": [1], "R": 0.1, "Q_T": [2]}, outputs={}
@@ -114,7 +117,7 @@ def compiled_loop(loop, folder, dtype="float64", name="lyapnet"):
     return CompiledLoop(LoopTraces(loop), library_of([folder / "policy.c"], c.FLAGS), style)
 
 
-@pytest.mark.parametrize("kind", sample(LOOPS, 8))
+@pytest.mark.parametrize("kind", sample(LOOPS, 9))
 def test_it_is_pythons_over_ten_thousand_steps(kind, tmp_path):
     loop = LOOPS[kind]()
     paths, agreement = export(loop, tmp_path / "loop", "c")
@@ -146,6 +149,21 @@ def test_one_long_run_is_pythons_too(tmp_path):
     assert found.x_hat == pytest.approx(loop.x_hat, rel=1e-9, abs=1e-9)
     assert found.memory.t == pytest.approx(loop.t, rel=1e-9)
     assert abs(loop.d_hat[0] + 0.2) < 0.1
+
+
+@pytest.mark.gate
+def test_a_setting_that_changes_begins_the_horizon_anew(tmp_path):
+    loop = LOOPS["settings"]()
+    found = compiled_loop(loop, tmp_path / "loop")
+    for step, goal in enumerate([0.2, 0.2, 0.2, -0.3, -0.3, None, 0.1]):
+        given = {} if goal is None else {"target_angle": goal}
+        own = found.step(np.array([0.3]), r=None if goal is None else np.array([goal]))
+        assert own == pytest.approx(loop.step([0.3], **given), rel=1e-9, abs=1e-9)
+        assert found.memory.begun == {3: 3, 4: 3, 5: 3, 6: 6}.get(step, 0)
+    before = found.x_hat[2]
+    found.step(np.array([0.3]), r=np.array([0.5]))
+    assert found.code & Bits.OUTSIDE[0], "outside of its range it stays"
+    assert found.x_hat[2] == before == 0.1
 
 
 @pytest.mark.gate

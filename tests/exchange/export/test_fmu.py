@@ -157,6 +157,22 @@ def test_parameters_of_a_family_are_set(version, tmp_path):
 
 
 @pytest.mark.gate
+@runs_here
+def test_settings_of_a_loop_are_inputs(tmp_path):
+    fmpy, validation = pytest.importorskip("fmpy"), pytest.importorskip("fmpy.validation")
+    loop = LOOPS["settings"]()
+    file, dt = str(unit_of(loop, tmp_path)), loop.controller.horizon.dt
+    assert validation.validate_fmu(file) == []
+    goals = [0.1, 0.1, -0.2, -0.2, 0.3, 0.3]
+    given = signal(["angle", "target_angle"], [(0.2, goal) for goal in goals], dt)
+    result = fmpy.simulate_fmu(
+        file, stop_time=5 * dt, step_size=dt, output_interval=dt, input=given, output=["torque"]
+    )  # fmt: skip
+    expected = [float(loop.step([0.2], target_angle=goal)[0]) for goal in goals[:-1]]
+    assert result["torque"][1:] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.gate
 @pytest.mark.parametrize("version", VERSIONS)
 def test_compilers_take_its_source_without_a_warning(version, tmp_path):
     file = unit_of(LOOPS["a pendulum"](), tmp_path, version)

@@ -142,10 +142,12 @@ def test_a_reading_of_an_angle_may_wrap_and_that_of_a_length_may_not():
 
 
 def test_the_first_uncertainty_is_that_of_a_uniform_state():
-    box = Box([-1.0, 2.0, 0.0], [3.0, 2.0, 0.0])
-    x = box.sample(100_000, seeded())
-    assert_close(initial_deviation(box)[0], x[:, 0].std(), rtol=0.01, atol=0)
-    assert_close(initial_deviation(box)[1:], torch.tensor([0.02, 0.01]))
+    box = Box([-1.0, 2.0, 0.0, -1.0], [3.0, 2.0, 0.0, 1.0])
+    x, problem = box.sample(100_000, seeded()), problem_of(Cartpole(), initial_states=box)
+    assert_close(initial_deviation(problem)[0], x[:, 0].std(), rtol=0.01, atol=0)
+    assert_close(initial_deviation(problem)[1:3], torch.tensor([0.02, 0.01]))
+    problem.system.settings = (3,)  # known exactly
+    assert_close(initial_deviation(problem)[3], torch.tensor(0.0))
     drift = least_drift(problem_of(DoubleIntegrator(), steps=25))
     assert_close(drift, torch.full((2,), 1e-4 / math.sqrt(3 * 2.5)))
 

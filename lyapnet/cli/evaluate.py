@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimator_of, of_a_controller
 
 if TYPE_CHECKING:
     from lyapnet.controller.controller import Controller
@@ -37,24 +37,11 @@ def evaluate(
     paths: Annotated[
         int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
     ] = 32,
-    outputs: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Also with an estimator: a measured state and its noise; of the system's output(x), only the noise.",
-            metavar="STATE=SIGMA",
-        ),
-    ] = None,
+    outputs: Measured = None,
     estimator: Annotated[
         str, typer.Option(help="The estimator, where outputs are measured: ekf or ukf, Kalman filters.")
     ] = "ekf",
-    deviation: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--initial-deviation",
-            help="Standard deviation of its first estimate: one for all states, or again for each.",
-            metavar="SIGMA",
-        ),
-    ] = None,
+    deviation: FirstDeviation = None,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -72,7 +59,7 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = given.load()
-    filtered = _estimator(controller, outputs or [], estimator, deviation)
+    filtered = estimator_of(controller, outputs or [], estimator, deviation)
     count = min(samples, 64)
     if until is not None:
         check_multiple(controller, until, count)
@@ -105,32 +92,6 @@ def evaluate(
         wrote = _write_figures(figures, controller, measured, later, filtered)
         report.rest()
         notes.print(wrote, soft_wrap=True)
-
-
-def _estimator(
-    controller: "Controller", outputs: list[str], kind: str, deviation: list[float] | None
-) -> "OutputFeedback | None":
-    """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
-    if not outputs:
-        if controller.measures_outputs:
-            return controller.with_estimator(kind, initial_deviation=deviation or None)
-        if kind != "ekf" or deviation:
-            raise UsageError(
-                "Expected --outputs, or outputs in the run's YAML, with --estimator and --initial-deviation, got none; "
-                "name what is measured: --outputs STATE=SIGMA."
-            )
-        return None
-    named = [text.rpartition("=") for text in outputs]
-    try:
-        noise = [float(value) for _, _, value in named]
-    except ValueError as error:
-        raise UsageError(
-            f"Expected --outputs STATE=SIGMA with a number, got {' '.join(outputs)}; as in --outputs angle=0.01."
-        ) from error
-    states = [name for name, _, _ in named if name]
-    if states and len(states) < len(named):
-        raise UsageError(f"Expected --outputs STATE=SIGMA for each, got {' '.join(outputs)}; name the state of each.")
-    return controller.with_estimator(kind, measure=states, noise=noise, initial_deviation=deviation or None)
 
 
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:

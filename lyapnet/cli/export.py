@@ -6,30 +6,48 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.base.errors import UsageError
+from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimator_of, of_a_controller
 
 
 @of_a_controller
 def export(
     given: Given,
-    to: Annotated[str, typer.Option(help="c, onnx or torch.")],
+    to: Annotated[str, typer.Option(help="c, fmu, onnx or torch.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
     name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
     beyond: Annotated[
         str | None, typer.Option(help="The law after T: hold, receding or riccati; else that which holds the goal.")
     ] = None,
+    dtype: Annotated[str, typer.Option(help="Of the numbers in C: float64 or float32.")] = "float64",
+    fmi: Annotated[str, typer.Option(help="The interface of an fmu: 2.0 or 3.0.")] = "2.0",
+    estimator: Annotated[
+        str | None,
+        typer.Option(help="In C and fmu, also the loop with an estimator of states that are not measured: ekf."),
+    ] = None,
+    outputs: Measured = None,
+    deviation: FirstDeviation = None,
     debug: Debug = False,
 ) -> None:
     """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
 
-    c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. onnx is a model (t, x) ↦ (u, V) of one
-    state, with p beside x for a family; torch is the same for torch.export.load.
+    c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. fmu is a unit for
+    co-simulation with that C inside. onnx is a model (t, x) ↦ (u, V) of one state, with p beside x for a family; torch
+    is the same for torch.export.load. With --estimator c and fmu have the loop, readings y ↦ u with a step for each Δt,
+    held against Python's over 10 000 steps.
     """
     from lyapnet.exchange.export import export as write
 
+    if estimator is None and (outputs or deviation):
+        raise UsageError("Expected --estimator with --outputs and --initial-deviation, got none; add --estimator ekf.")
     controller = given.load() if beyond is None else given.load().continued(beyond)
+    exported = controller
+    if estimator is not None:
+        exported = estimator_of(controller, outputs or [], estimator, deviation)
+        if exported is None:
+            raise UsageError("Expected --outputs, or outputs in the run's YAML, with --estimator, got none; name them.")
     given.report("writing and verifying")
-    paths, agreement = write(controller, out, to, given.checkpoint, name)
+    paths, agreement = write(exported, out, to, given.checkpoint, name, dtype, fmi)
     given.report.rest()
     notes = Console(highlight=False, markup=False)
     if beyond is None:

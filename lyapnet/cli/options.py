@@ -28,6 +28,22 @@ At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
 ]
+Measured = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--outputs",
+        help="With an estimator: a measured state and its noise; of the system's output(x), only the noise.",
+        metavar="STATE=SIGMA",
+    ),
+]
+FirstDeviation = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--initial-deviation",
+        help="Standard deviation of its first estimate: one for all states, or again for each.",
+        metavar="SIGMA",
+    ),
+]
 OWN = {
     "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",
     "constraints": "constraints", "program": "a program",
@@ -286,3 +302,27 @@ def member_of(controller: Any, at: list[str]) -> Any:
     if len(parameters) < len(at):
         raise UsageError(f"Expected --at once for each parameter, got {' '.join(at)}; leave one of them out.")
     return controller.with_(**parameters)
+
+
+def estimator_of(controller: Any, outputs: list[str], kind: str, deviation: list[float] | None) -> Any:
+    """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
+    if not outputs:
+        if controller.measures_outputs:
+            return controller.with_estimator(kind, initial_deviation=deviation or None)
+        if kind != "ekf" or deviation:
+            raise UsageError(
+                "Expected --outputs, or outputs in the run's YAML, with --estimator and --initial-deviation, got none; "
+                "name what is measured: --outputs STATE=SIGMA."
+            )
+        return None
+    named = [text.rpartition("=") for text in outputs]
+    try:
+        noise = [float(value) for _, _, value in named]
+    except ValueError as error:
+        raise UsageError(
+            f"Expected --outputs STATE=SIGMA with a number, got {' '.join(outputs)}; as in --outputs angle=0.01."
+        ) from error
+    states = [name for name, _, _ in named if name]
+    if states and len(states) < len(named):
+        raise UsageError(f"Expected --outputs STATE=SIGMA for each, got {' '.join(outputs)}; name the state of each.")
+    return controller.with_estimator(kind, measure=states, noise=noise, initial_deviation=deviation or None)

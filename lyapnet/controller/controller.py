@@ -313,7 +313,7 @@ class Controller:
             )
         return OutputFeedback(
             self.law, problem_of_estimator(section, problem), parts.outputs, kind, parts.drift, parts.deviation,
-            around_state=section.initial_deviation is not None,
+            around_state=section.initial_deviation is not None, controller=self,
         )  # fmt: skip
 
     def continued(self, beyond: str) -> "Controller":

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import State
+from lyapnet.base.types import Control, State
 from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
 from lyapnet.task.family import LOGARITHM
 from lyapnet.task.input_disturbances import DisturbedSystem
-from lyapnet.task.outputs import Outputs
+from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 
@@ -38,6 +38,7 @@ class OutputFeedback:
         drift: see KalmanFilter.
         deviation: standard deviation of the first estimate, (n,).
         around_state: whether evaluations draw the first estimate around x₀ by this deviation, or take the centre of X₀.
+        controller: the Controller whose law it is, for exports.
 
     Raises:
         UsageError: unknown kind.
@@ -45,21 +46,23 @@ class OutputFeedback:
 
     problem: Problem
     filter: KalmanFilter
+    state_of_law: State  # a state that its law takes: its length, precision and device
+    settings: dict[str, int]  # those of a family: name ↦ index of the state
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
-        deviation: Deviations, around_state: bool = False,
+        deviation: Deviations, around_state: bool = False, controller: Any = None,
     ):  # fmt: skip
         if kind not in FILTERS:
             raise UsageError(f"Expected an estimator as one of {', '.join(FILTERS)}, got {kind!r}; choose one of them.")
         self.law, self.kind, self.outputs = law, kind, outputs
-        self.deviation, self.around_state = deviation, around_state
-        self._state_of_law = problem.initial_states.lower[: law.system.n]  # its precision, device and length
+        self.deviation, self.around_state, self.controller = deviation, around_state, controller
+        self.state_of_law = problem.initial_states.lower[: law.system.n]
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
         self._controls = problem.controls
         self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
         names = problem.system.state_names
-        self._settings = {names[i].removeprefix(LOGARITHM): i for i in problem.system.settings}
+        self.settings = {names[i].removeprefix(LOGARITHM): i for i in problem.system.settings}
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 
@@ -101,7 +104,7 @@ class OutputFeedback:
         box, constants = self.problem.initial_states, list(self.problem.system.constants)
         around = (box.widths == 0) | self.around_state
         around[constants] = False
-        around[list(self._settings.values())] = True
+        around[list(self.settings.values())] = True
         near = x0 + self.deviation * torch.randn(x0.shape, generator=generator, dtype=torch.float64)
         return torch.where(around, near, box.center)
 
@@ -123,11 +126,10 @@ class OutputFeedback:
     @property
     def d_hat(self) -> Any:
         """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 where none is estimated."""
-        return in_form_of(self._like, self._d_hat)
+        return in_form_of(self._like, self._disturbances(self._belief.x))
 
-    @property
-    def _d_hat(self) -> Tensor:
-        return self._belief.x[..., self.problem.system.n - len(self._disturbed) :]
+    def _disturbances(self, x: State) -> Tensor:
+        return x[..., self.problem.system.n - len(self._disturbed) :]
 
     @property
     def P(self) -> Any:
@@ -152,13 +154,22 @@ class OutputFeedback:
         self.observe(y, applied)
         if settings:
             self._change(settings)
-        like = self._state_of_law
+        like = self.state_of_law
         u = self.law(like.new_tensor(self._t - self._began), self._belief.x[..., : len(like)].to(like)).detach()
-        if self._disturbed:
-            disturbed = torch.tensor(self._disturbed, device=u.device)
-            u = self._controls.project(u.index_add(-1, disturbed, self._d_hat.to(u), alpha=-1))
+        u = self.without_disturbances(u, self._belief.x)
         self._u = u.double().cpu()
         return in_form_of(y, u)
+
+    def without_disturbances(self, u: Control, x: State) -> Control:
+        """u − d̂ within the limits, for the estimate x (*batch, n); u where no disturbance is estimated."""
+        if not self._disturbed:
+            return u
+        disturbed = torch.tensor(self._disturbed, device=u.device)
+        return self._controls.project(u.index_add(-1, disturbed, self._disturbances(x).to(u), alpha=-1))
+
+    def corrected(self, belief: Belief, y: Readings) -> Belief:
+        """The belief after readings y, with parameters within their ranges."""
+        return self._with_parameters_in_range(self.filter.update(belief, y))
 
     @torch.no_grad()
     def observe(self, y: Any, applied: Any = None) -> None:
@@ -179,16 +190,24 @@ class OutputFeedback:
         else:
             u = self._u if applied is None else self._applied(applied, self._u)
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
-        self._belief = self._with_parameters_in_range(self.filter.update(belief, readings))
+        self._belief = self.corrected(belief, readings)
+
+    def named_settings(self, states: Tensor) -> dict[str, Tensor]:
+        """Settings by name, as `step` takes them, from the states that hold them, (*batch, k): weights from log₁₀."""
+        names = self.problem.system.state_names
+        return {
+            name: 10**entry if names[i].startswith(LOGARITHM) else entry
+            for (name, i), entry in zip(self.settings.items(), states.unbind(-1), strict=True)
+        }
 
     def _change(self, settings: Mapping[str, Any]) -> None:
         """Take settings; if one differs, the horizon begins now."""
         x, box = self._belief.x.clone(), self.problem.initial_states
         for name, value in settings.items():
-            if name not in self._settings:
-                known = ", ".join(self._settings) or "none"
+            if name not in self.settings:
+                known = ", ".join(self.settings) or "none"
                 raise ValueError(f"Expected settings among {known}, got {name!r}; correct the name, or leave it out.")
-            i = self._settings[name]
+            i = self.settings[name]
             low, high, number = float(box.lower[i]), float(box.upper[i]), _float64(value)
             weight = self.problem.system.state_names[i].startswith(LOGARITHM)
             number = number.log10() if weight else number

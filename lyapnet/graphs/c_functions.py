@@ -2,7 +2,7 @@
 
 torch computes operations on constants, and their results become tables. Views, such as a transposition or a slice,
 need no code: an array is a place in memory with strides. All other operations become loops, whose inner line RULES
-gives; identical loops are written once. Memory is allocated only on the stack.
+gives; identical loops are written once, and then arranged (c_loops). Memory is allocated only on the stack.
 """
 
 import copy
@@ -15,18 +15,19 @@ from torch.fx import GraphModule, Interpreter, Node
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lyapnet.base.errors import ExportError, one_line
+from lyapnet.graphs.c_loops import arranged
 from lyapnet.graphs.c_rules import RULES
 from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of
 
 aten = torch.ops.aten
-STACK = 1_000_000  # largest size of the arrays of one function in bytes: stacks have a few megabytes
+STACK = 1_000_000  # largest size of the arrays of one function in bytes, in double precision: stacks have megabytes
 
 
 def c_function(
     signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
 ) -> tuple[str, int]:
-    """The text of a C function for a trace, and the size of its arrays on the stack in bytes.
+    """The text of a C function for a trace, and how many numbers its arrays on the stack hold.
 
     Args:
         signature: of the function, such as `void f(const double *x, double *y)`.
@@ -39,14 +40,14 @@ def c_function(
         ExportError: an operator has no rule, or the arrays need more than STACK bytes.
     """
     text = Text(tables)
-    for name in arguments:  # a function may not use all of its arguments
-        text.mark_unused(name)
     write_body(text, graph, arguments, results)
-    if text.bytes > STACK:
+    lines, size = arranged(text.statements, text.arrays)
+    if 8 * size > STACK:
         raise ExportError(
-            f"Expected a law whose arrays fit on a stack, got {text.bytes / 1e6:.3g} MB; export it to torch or onnx."
+            f"Expected a law whose arrays fit on a stack, got {8 * size / 1e6:.3g} MB; export it to torch or onnx."
         )
-    return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n", text.bytes
+    unused = [f"(void){name};" for name in arguments]  # a function may not use all of its arguments
+    return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in [*unused, *lines]) + "}\n", size
 
 
 def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str]) -> None:
@@ -60,7 +61,6 @@ def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], res
     outputs = _Translator(graph, text).run(*inputs)
     for name, output in zip(results, outputs, strict=True):
         text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
-    text.mark_unread()
 
 
 def _remove_shape_sources(graph: GraphModule) -> GraphModule:
@@ -92,6 +92,27 @@ static double remainder_of(double a, double b)
 """,
     "larger(": "static double larger(double a, double b) { return a > b || a != a ? a : b; }\n",
     "smaller(": "static double smaller(double a, double b) { return a < b || a != a ? a : b; }\n",
+    "sum_products(": """/* y[i] = sum over j < n of a[j] b[step i + j], for i < k; eight sums at a time */
+static void sum_products(int k, int n, int step, const double *a, const double *b, double *y)
+{
+    for (int i = 0; i < k; i++, b += step) {
+        double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, s4 = 0.0, s5 = 0.0, s6 = 0.0, s7 = 0.0;
+        int j = 0;
+        for (; j + 8 <= n; j += 8) {
+            s0 += a[j] * b[j];
+            s1 += a[j + 1] * b[j + 1];
+            s2 += a[j + 2] * b[j + 2];
+            s3 += a[j + 3] * b[j + 3];
+            s4 += a[j + 4] * b[j + 4];
+            s5 += a[j + 5] * b[j + 5];
+            s6 += a[j + 6] * b[j + 6];
+            s7 += a[j + 7] * b[j + 7];
+        }
+        for (; j < n; j++) s0 += a[j] * b[j];
+        y[i] = ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7));
+    }
+}
+""",
     "solve(": """static void exchange(int n, double *a, double *b)
 {
     for (int i = 0; i < n; i++) {

@@ -81,15 +81,26 @@ def _norm(text: Text, x: Array, ord: float = 2, dim: Any = None, keepdim: bool =
 
 
 def _product(text: Text, A: Any, B: Any) -> Array:
-    """AB for matrices, vectors or batches of matrices; the innermost loop is along rows of B, which are contiguous."""
+    """AB for matrices, vectors or batches of matrices.
+
+    The innermost loop is along rows of B, which are contiguous; where rows of A and columns of B are contiguous
+    instead, as in W'x with a table of W, it is a sum of their products.
+    """
     a, b = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
     shape = (torch.empty(a.shape, device="meta") @ torch.empty(b.shape, device="meta")).shape
     left = a.layout if a.layout.ndim > 1 else a.layout[None]
     right = b.layout if b.layout.ndim > 1 else b.layout[:, None]
-    k, columns = left.shape[-2], right.shape[-1]
+    k, n, columns = left.shape[-2], left.shape[-1], right.shape[-1]
     batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
-    whole = (*batch, k, left.shape[-1], columns)
     result = text.new((*batch, k, columns))
+    if text.rows and not batch and n >= LONG and left.stride(-1) == right.stride(-2) == 1:
+        if columns == 1:  # the rows of A, one after another
+            starts = Array(b.name, right[0, 0]), Array(a.name, left[0, 0]), Array(result.name, result.layout[0, 0])
+            return _sums(text, k, n, left.stride(0), *starts, result, shape)
+        if right.stride(1) > 1:
+            starts = Array(a.name, left[:, 0]), Array(b.name, right[0, 0]), Array(result.name, result.layout[:, 0])
+            return _sums(text, columns, n, right.stride(1), *starts, result, shape)
+    whole = (*batch, k, n, columns)
     text.each(result.shape, [0.0], "{into} = {0};", result)
     text.each(
         whole,
@@ -98,6 +109,15 @@ def _product(text: Text, A: Any, B: Any) -> Array:
         Array(result.name, result.layout[..., None, :].expand(whole)),
     )
     return Array(result.name, result.layout.reshape(shape))
+
+
+LONG = 8  # terms from which a sum of products is a call
+
+
+def _sums(text: Text, k: int, n: int, step: int, a: Array, b: Array, into: Array, whole: Array, shape: Any) -> Array:
+    """A product by calls: each is k sums of n products of the entries from a on, and of those from b + i step on."""
+    text.each(into.shape, [a, b], f"{text.rows}({k}, {n}, {step}, &{{0}}, &{{1}}, &{{into}});", into)
+    return Array(whole.name, whole.layout.reshape(shape))
 
 
 def _identity(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **options: Any) -> Any:
@@ -151,7 +171,7 @@ def _rearrangement(target: Any) -> Callable[..., Array]:
         places = target(torch.arange(x.layout.numel()).reshape(x.shape), *args, **kwargs)
         result = text.new(places.shape)
         for i, place in enumerate(places.flatten().tolist()):
-            text.lines.append(f"{result.name}[{i}] = {x.name}[{place}];")
+            text.add(f"{result.name}[{i}] = {x.name}[{place}];")
         return result
 
     return rule
@@ -169,7 +189,6 @@ def _extreme(relation: str) -> Callable[..., Any]:
         line = f"if ({is_better}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
         for k in range(1, x.shape[dim]):
             text.each(value.shape, [Array(x.name, x.layout.select(dim, k)), value, float(k)], line, index)
-        text.mark_unused(index.name)
         found = value, index
         return [Array(y.name, y.layout.unsqueeze(dim)) if keepdim else y for y in found]
 
@@ -257,7 +276,7 @@ def _solution(text: Text, A: Any, B: Any, *, left: bool = True, check_errors: bo
             parts = tuple(Array(part.name, part.layout.mT) for part in parts)
         copied, answer = (text.copy(part, text.new(part.shape)) for part in parts)
         n, columns = answer.shape
-        text.lines.append(f"solve({n}, {columns}, {copied.name}, {answer.name});")
+        text.add(f"solve({n}, {columns}, {copied.name}, {answer.name});")
         text.copy(answer if left else Array(answer.name, answer.layout.mT), Array(whole.name, whole.layout[place]))
     return [Array(whole.name, whole.layout[..., 0]) if vectors else whole, None, None, NO_ERROR]
 
@@ -274,7 +293,7 @@ def _determinant(text: Text, A: Array) -> list[Array]:
     whole = text.new(A.shape[:-2])
     for k, place in enumerate(itertools.product(*map(range, A.shape[:-2]))):
         copied = text.copy(Array(A.name, A.layout[place]), text.new(A.shape[-2:]))
-        text.lines.append(f"{whole.name}[{k}] = solve({A.shape[-1]}, 0, {copied.name}, {copied.name});")
+        text.add(f"{whole.name}[{k}] = solve({A.shape[-1]}, 0, {copied.name}, {copied.name});")
     return [whole]
 
 

@@ -1,4 +1,4 @@
-"""Text of C99: arrays in memory, tables of constants, and loops over them."""
+"""Text of C99: arrays in memory, tables of constants, and loops over them; in double or in single precision."""
 
 import math
 import re
@@ -6,9 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
+
+from lyapnet.graphs.c_loops import Statement
 
 PER_LINE = 8  # numbers of a table in one line
 
@@ -36,21 +39,29 @@ class Place(NamedTuple):
 
 
 class Tables:
-    """The constants of functions; equal constants share one table."""
+    """The constants of functions; equal constants share one table, and so do a matrix and its transpose."""
+
+    shares_transposes = True
 
     def __init__(self) -> None:
         self.text: list[str] = []
-        self._known: dict[tuple[Any, ...], Array] = {}
+        self.count = 0  # of numbers
+        self._known: dict[bytes, str] = {}  # numbers ↦ their table
 
     def of(self, constant: Tensor) -> Array:
         """The table of a constant."""
         numbers = constant.detach().cpu().contiguous().to(torch.float64)
-        key = tuple(numbers.shape), numbers.numpy().tobytes()
-        if key not in self._known:
+        name = self._known.get(_bytes_of(numbers))
+        if name is None and self.shares_transposes and numbers.ndim > 1:
+            turned = numbers.mT.contiguous()
+            if (other := self._known.get(_bytes_of(turned))) is not None:
+                return Array(other, torch.empty(turned.shape, device="meta").mT)
+        if name is None:
             name = f"w{len(self._known)}"
             self.text.append(self.format_table(name, numbers))
-            self._known[key] = Array(name, torch.empty(numbers.shape, device="meta"))
-        return self._known[key]
+            self.count += max(1, numbers.numel())
+            self._known[_bytes_of(numbers)] = name
+        return Array(name, torch.empty(numbers.shape, device="meta"))
 
     def format_table(self, name: str, numbers: Tensor) -> str:
         """The declaration of a table of float64 numbers."""
@@ -60,62 +71,53 @@ class Tables:
 
 
 class Text:
-    """The body of a C function, line by line; subclasses write similar languages.
+    """The body of a C function, statement by statement; subclasses write similar languages.
 
     Args:
         tables: collects the constants.
     """
 
     language, otherwise = "C", "export it to torch"  # for error messages
-    declaration = "double {name}[{size}];"  # of an array
-    counter = "int"  # declares a loop counter
     to_index = "(int)"  # converts a number to an index
+    rows: str | None = "sum_products"  # the function for sums of products of rows; None: loops
 
     def __init__(self, tables: Tables):
-        self.tables, self.lines, self.bytes, self._count = tables, list[str](), 0, 0
+        self.tables, self.statements, self.arrays = tables, list[Statement](), dict[str, int]()
+        self._count = 0
         self._known: dict[str, int] = {}  # lines, with their new arrays numbered from 0 ↦ number of the first one
 
     def new(self, shape: Sequence[int]) -> Array:
-        """Declare a new array."""
+        """A new array."""
         name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
-        size = max(1, layout.numel())
-        self._count, self.bytes = self._count + 1, self.bytes + 8 * size
-        self.lines.append(self.declaration.format(name=name, size=size))
+        self._count += 1
+        self.arrays[name] = max(1, layout.numel())
         return Array(name, layout)
+
+    def add(self, line: str, sizes: Sequence[int] = ()) -> None:
+        """Write a line, in loops over sizes."""
+        self.statements.append(Statement(tuple(sizes), line))
 
     def once(self, write: Callable[[], Any]) -> Any:
         """Call `write`; if its lines already exist, remove the new ones and return the earlier arrays.
 
         This is correct because an array is written only where it is created, so that equal lines have equal results.
         """
-        lines, first, size = len(self.lines), self._count, self.bytes
+        start, first = len(self.statements), self._count
         result = write()
-        earlier = self._known.setdefault(_renamed("\n".join(self.lines[lines:]), first, "v+", 0), first)
+        lines = "\n".join(f"{each.sizes} {each.line}" for each in self.statements[start:])
+        earlier = self._known.setdefault(_renamed(lines, first, "v+", 0), first)
         if self._count == first or earlier == first:
             return result
-        del self.lines[lines:]
-        self._count, self.bytes = first, size
+        del self.statements[start:]
+        for k in range(first, self._count):
+            del self.arrays[f"v{k}"]
+        self._count = first
         return tree_map(
             lambda leaf: (
                 replace(leaf, name=_renamed(leaf.name, first, "v", earlier)) if isinstance(leaf, Array) else leaf
             ),
             result,
         )
-
-    def mark_unused(self, name: str) -> None:
-        """Tell the compiler not to warn if an array is unused."""
-        self.lines.append(f"(void){name};")
-
-    def mark_unread(self) -> None:
-        """Mark arrays as unused that are written but never read, such as unused results of an operation."""
-        at = dict[str, list[int]]()
-        for k, line in enumerate(self.lines):
-            for name in set(re.findall(r"\bv\d+\b", line)):
-                at.setdefault(name, []).append(k)
-        for name, places in at.items():
-            written = rf"\s*{name}\[[^]]*\] = (?!.*\b{name}\b)"
-            if all(re.match(written, self.lines[k]) for k in places[1:]):
-                self.lines[places[0]] += f" (void){name};"
 
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
         """Write loops over a shape around a line, in which {0}, {1}, … are entries of the values, {into} the result.
@@ -137,9 +139,7 @@ class Text:
             steps = [(f"i{k}", strides[column]) for k, (_, strides) in enumerate(axes)]
             places.append(Place(array.name, _index(int(layout.storage_offset()), steps)))
             column += 1
-        for k, (size, _) in enumerate(axes):
-            self.lines.append(f"{'    ' * k}for ({self.counter} i{k} = 0; i{k} < {size}; i{k}++)")
-        self.lines.append("    " * len(axes) + line.format(*places[:-1], into=places[-1]))
+        self.add(line.format(*places[:-1], into=places[-1]), [size for size, _ in axes])
         return into
 
     def copy(self, source: Any, into: Array) -> Array:
@@ -183,6 +183,32 @@ def literal(number: float) -> str:
     if math.isinf(number):
         return "INFINITY" if number > 0 else "-INFINITY"
     return repr(float(number))
+
+
+FUNCTIONS = (  # of the C library, in double precision
+    "acosh?|asinh?|atan[2h]?|cbrt|ceil|copysign|cosh?|erfc?|exp2?|expm1|fabs|fdim|floor|fma|fmax|fmin|fmod|hypot|lgamma|"
+    "log(?:10|1p|2)?|nearbyint|pow|rint|round|sinh?|sqrt|tanh?|tgamma|trunc"
+)
+IN_DOUBLE = re.compile(
+    rf"\bdouble\b|\b(?:{FUNCTIONS})(?=\()|(?<![\w.])(?:\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)(?![\w.])"
+)
+
+
+def in_single_precision(code: str) -> str:
+    """C code in single precision: float, sinf and 0.1f in the place of double, sin and 0.1."""
+    return IN_DOUBLE.sub(lambda word: _single(word[0]), code)
+
+
+def _single(word: str) -> str:
+    if not word[0].isdigit():
+        return "float" if word == "double" else f"{word}f"
+    with np.errstate(over="ignore"):
+        number = np.float32(word)
+    return f"{number!s}f" if np.isfinite(number) else "INFINITY"
+
+
+def _bytes_of(numbers: Tensor) -> bytes:
+    return numbers.numpy().tobytes()
 
 
 def _axes(shape: Sequence[int], layouts: Sequence[Tensor]) -> list[tuple[int, tuple[int, ...]]]:

@@ -7,11 +7,14 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.graphs.c_functions import write_body
+from lyapnet.graphs.c_loops import loop_heads
 from lyapnet.graphs.c_text import Tables, Text
 
 
 class JavaScriptTables(Tables):
     """The constants of JavaScript functions, with every bit."""
+
+    shares_transposes = False  # loops along columns are slower
 
     def format_table(self, name: str, numbers: Tensor) -> str:
         content = base64.b64encode(numbers.numpy().astype("<f8").tobytes()).decode()
@@ -22,14 +25,7 @@ class JavaScriptText(Text):
     """The body of a JavaScript function, line by line; its arrays are declared outside of the function."""
 
     language, otherwise = "JavaScript", "use lyapnet animate"
-    declaration = "const {name} = new Float64Array({size});"
-    counter, to_index = "let", ""
-
-    def mark_unused(self, name: str) -> None:
-        pass
-
-    def mark_unread(self) -> None:
-        pass
+    to_index, rows = "", None
 
 
 def javascript_function(
@@ -49,8 +45,9 @@ def javascript_function(
     """
     text = JavaScriptText(tables)
     write_body(text, graph, arguments, results)
-    head, body = (
-        "\n".join(line for line in text.lines if line.startswith("const ") is declares) for declares in (True, False)
+    head = "\n".join(f"const {array} = new Float64Array({size});" for array, size in text.arrays.items())
+    body = "\n".join(
+        "\n".join([*loop_heads(each.sizes, "let"), "    " * len(each.sizes) + each.line]) for each in text.statements
     )
     parameters = ", ".join([*arguments, *results])
     return f"const {name} = (() => {{\n{head}\nreturn ({parameters}) => {{\n{body}\n}};\n}})();\n"

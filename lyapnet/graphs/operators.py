@@ -84,7 +84,7 @@ def _of_library(name: str, domain: tuple[float, float] = ANY, casadi: Any = "", 
 
 
 def _comparison(name: str, sign: str, casadi: Callable[..., Any]) -> Operator:
-    return Operator(name, f"{{0}} {sign} {{1}}", casadi, f"x {sign} y ? ONE : ZERO", (ANY, ANY))
+    return Operator(name, f"{{0}} {sign} {{1}} ? 1.0 : 0.0", casadi, f"x {sign} y ? ONE : ZERO", (ANY, ANY))
 
 
 def _logical(name: str, sign: str, casadi: str) -> list[Operator]:
@@ -99,7 +99,7 @@ def _remainder(casadi: Any, a: Any, b: Any) -> Any:
     return casadi.if_else(casadi.logic_and(r != 0, (r < 0) != (b < 0)), r + b, r)
 
 
-_SIGN = "({0} > 0) - ({0} < 0)", "sign", "x > 0 ? ONE : (x < 0 ? -ONE : ZERO)"
+_SIGN = "{0} > 0 ? 1.0 : {0} < 0 ? -1.0 : 0.0", "sign", "x > 0 ? ONE : (x < 0 ? -ONE : ZERO)"
 
 _ROWS = [
     Operator("abs", "fabs({0})", "fabs", "(absolute<T, V>(x))"),

@@ -121,7 +121,7 @@ def _agreements(checkpoint: Path, precision: str) -> dict[str, dict[str, float]]
         controller = load(rounded)
         for to, file in EXPORTS.items():
             _, agreement = export(controller, Path(folder, file), to, rounded)
-            found[to] = agreement._asdict()
+            found[to] = {key: value for key, value in agreement._asdict().items() if key != "loop"}
     return found
 
 

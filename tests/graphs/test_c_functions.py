@@ -12,13 +12,16 @@ from torch.testing import assert_close
 from lyapnet.base.errors import ExportError
 from lyapnet.graphs import c_rules
 from lyapnet.graphs.c_functions import c_function, helpers
-from lyapnet.graphs.c_text import Tables, literal
+from lyapnet.graphs.c_text import Tables, in_single_precision, literal
 from lyapnet.graphs.tracing import core_trace
 from tests.graphs.test_casadi_functions import FUNCTIONS as OF_CASADI
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+WEIGHTS = torch.linspace(-1, 1, 4 * 10, dtype=torch.float64).reshape(10, 4).sin()
 FUNCTIONS = OF_CASADI | {
+    "a layer and back": lambda x: torch.tanh(x @ WEIGHTS.mT) @ WEIGHTS,
+    "long sums": lambda x: WEIGHTS.mT @ torch.tanh(WEIGHTS @ x[0]) + (x @ WEIGHTS.mT) @ x.sin().expand(10, 4),
     "one extreme": lambda x: x.min(-1).values,
     "places of extremes": lambda x: x.max(-1).indices + x.argmin(-1, keepdim=True) + x.min() + x[0].sum(-1).sum(-1),
     "computed places": lambda x: x.gather(-1, x.argmax(-1, True)) * x,
@@ -36,10 +39,9 @@ FUNCTIONS = OF_CASADI | {
     "undefined": lambda x: torch.nan_to_num(x / x - 1, nan=2.0),
 }  # fmt: skip
 POINT = torch.tensor([[0.3, -0.8, 1.7, -2.2]], dtype=torch.float64)
-DOUBLES = ctypes.POINTER(ctypes.c_double)
 
 
-def written(functions, folder):
+def written(functions, folder, compiler="cc", single=False):
     """name ↦ a Python function of one of several functions of x (1, 4), all in one C library."""
     tables, bodies = Tables(), []
     for name, function in functions.items():
@@ -47,17 +49,18 @@ def written(functions, folder):
         signature = f"void {name.replace(' ', '_')}(const double *x, double *y)"
         bodies.append(signature + ";\n" + c_function(signature, graph, {"x": POINT}, ["y"], tables)[0])
     code = "\n".join(bodies)
-    (folder / "f.c").write_text("\n".join(["#include <math.h>", *helpers(code), *tables.text, code]))
-    library = folder / "f.so"
-    command = ["cc", *STRICT, "-shared", "-fPIC", "-o", str(library), str(folder / "f.c"), "-lm"]
+    text = "\n".join(["#include <math.h>", *helpers(code), *tables.text, code])
+    (folder / "f.c").write_text(in_single_precision(text) if single else text)
+    library, kind = folder / "f.so", np.float32 if single else np.float64
+    command = [compiler, *STRICT, "-shared", "-fPIC", "-o", str(library), str(folder / "f.c"), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     loaded = ctypes.CDLL(str(library))
 
     def calling(name, size):
         def call(x):
-            y = np.empty(size)
-            getattr(loaded, name.replace(" ", "_"))(x.numpy().copy().ctypes.data_as(DOUBLES), y.ctypes.data_as(DOUBLES))
+            given, y = x.numpy().astype(kind), np.empty(size, kind)
+            getattr(loaded, name.replace(" ", "_"))(*(each.ctypes.data_as(ctypes.c_void_p) for each in (given, y)))
             return torch.from_numpy(y)
 
         return call
@@ -77,6 +80,26 @@ def test_operations_of_user_systems_are_written(name, in_c):
         assert_close(in_c[name](x), FUNCTIONS[name](x).flatten(), rtol=1e-12, atol=1e-13, equal_nan=True)
 
 
+@pytest.mark.gate
+@pytest.mark.parametrize("single", [False, True], ids=["double", "single"])
+@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+def test_compilers_take_each_precision_without_a_warning(compiler, single, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler}")
+    found = written(FUNCTIONS, tmp_path, compiler, single)
+    tolerance = 1e-4 if single else 1e-12
+    for name in ("a layer and back", "long sums", "trigonometry", "powers", "branches", "products"):
+        y = found[name](POINT)
+        assert y.dtype == (torch.float32 if single else torch.float64)
+        assert_close(y.double(), FUNCTIONS[name](POINT).flatten(), rtol=tolerance, atol=tolerance, equal_nan=True)
+
+
+def test_single_precision_is_a_matter_of_words():
+    code = "double v1 = sin(2.5 * v0[3 * i0 + 1]) + 1e-9 - asinh(w12[0]) + 1e300 + sine(4) + v1.x;"
+    single = "float v1 = sinf(2.5f * v0[3 * i0 + 1]) + 1e-09f - asinhf(w12[0]) + INFINITY + sine(4) + v1.x;"
+    assert in_single_precision(code) == single
+
+
 def test_the_same_operations_are_written_once():
     def lines_of(function):
         graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)], "a function", ExportError)
@@ -84,11 +107,20 @@ def test_the_same_operations_are_written_once():
 
     once, size = lines_of(lambda x: x.sin().exp())
     again, same_size = lines_of(lambda x: x.sin().exp() + 0 * x[0].sin().exp()[None])
-    other, larger_size = lines_of(lambda x: x.sin().exp() + 0 * (1.0 + x[0]).sin().exp()[None])
+    other, _ = lines_of(lambda x: x.sin().exp() + 0 * (1.0 + x[0]).sin().exp()[None])
     assert again.count("sin(") == again.count("exp(") == once.count("sin(") == 1
-    assert same_size == size + 2 * 4 * 8
+    assert same_size == size == 0, "one loop, in which all are numbers"
     assert other.count("sin(") == 2
-    assert larger_size > same_size
+
+
+def test_a_matrix_and_its_transpose_are_one_table():
+    W = torch.randn(9, 4, generator=torch.Generator().manual_seed(0)).double()
+    function = lambda x: torch.tanh(x @ W.mT) @ W  # noqa: E731
+    graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)], "a function", ExportError)
+    tables = Tables()
+    body, _ = c_function("void f(const double *x, double *y)", graph, {"x": POINT}, ["y"], tables)
+    assert (len(tables.text), tables.count) == (1, 36)
+    assert "sum_products(" in body
 
 
 @pytest.mark.gate

@@ -5,68 +5,229 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from lyapnet.base.errors import ExportError
 from lyapnet.controller.controller import Controller
 from lyapnet.exchange.export.law import Law
+from lyapnet.exchange.export.verification import Points
 from lyapnet.graphs.c_functions import c_function, helpers
-from lyapnet.graphs.c_text import Tables, literal
+from lyapnet.graphs.c_text import Tables, in_single_precision, literal
+from lyapnet.task.domain import SLACK
+from lyapnet.task.sets import ControlBox, ControlSet
 
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
+FLAGS = (*STRICT, "-O2")
 FAST = ("-std=c99", "-O3")
 NAME = "lyapnet"  # what names begin with, unless told otherwise
 
 
-def sources(controller: Controller, law: Law, about: Mapping[str, str], name: str = NAME) -> dict[str, str]:
+@dataclass(frozen=True)
+class Style:
+    """How C is written.
+
+    Args:
+        name: what the names of its functions, types and macros begin with: an identifier of C.
+        dtype: of all its numbers, float64 or float32.
+    """
+
+    name: str = NAME
+    dtype: torch.dtype = torch.float64
+
+    @property
+    def macro(self) -> str:
+        """What its macros begin with."""
+        return self.name.upper()
+
+    @property
+    def real(self) -> str:
+        """The name of the type of its numbers in the header."""
+        return f"{self.name}_real"
+
+    @property
+    def single(self) -> bool:
+        """Whether its numbers are floats."""
+        return self.dtype == torch.float32
+
+    @property
+    def size(self) -> int:
+        """Bytes of a number."""
+        return self.dtype.itemsize
+
+    @property
+    def numpy(self) -> Any:
+        """NumPy's type of its numbers."""
+        return np.float32 if self.single else np.float64
+
+    def code(self, text: str) -> str:
+        """Code in double precision, in the precision of this style; WIDE is double in each."""
+        return (in_single_precision(text) if self.single else text).replace("WIDE", "double")
+
+
+class Bits:
+    """What the functions return: 0, or the sum of these, as macros: name ↦ (number, what it says)."""
+
+    NOT_FINITE = 1, "u is not finite; a loop holds the control before it and its last finite estimate"
+    OUTSIDE = 2, "x is outside of the states that it was compared on: closed loops from X0, and 20 % around"
+    OUTSIDE_X0 = 4, "x is outside of X0 at t <= 0; of a loop by more than three standard deviations"
+    OUTSIDE_DOMAIN = 8, "x is where f, g or the cost are not defined"
+    MISSING = 16, "a reading is not finite, and was left out"
+
+
+def file_comment(facts: Mapping[str, str]) -> str:
+    """Facts as the comment at the top of a file."""
+    lines = "\n   ".join(f"{key}: {value}" for key, value in facts.items())
+    return "/* " + lines.replace("*/", "* /").replace("/*", "/ *") + " */\n"
+
+
+def sources(
+    controller: Controller, law: Law, facts: Mapping[str, str], style: Style, tried: Points, loop: Any = None
+) -> dict[str, str]:
     """File name ↦ text.
 
     Args:
-        about: what is exported, for the comment at the top.
-        name: what the names of its functions and macros begin with: an identifier of C.
+        facts: what is exported, for the comment at the top.
+        style: names and precision.
+        tried: what it is compared on, beyond which a return code says so.
+        loop: the estimator around the law, as `LoopTraces`; None: the law alone.
 
     Raises:
         ExportError: an operation has no rule in C; or the law is too large for a stack.
     """
     tables, arrays = Tables(), "".join(f"const double *{argument}, " for argument in law.arguments)
-    functions, stack = zip(
-        *(
-            c_function(f"static void {result}_of({arrays}double *y)", graph, law.arguments, ["y"], tables)
-            for result, graph in (("control", law.control), ("value", law.value))
-        ),
-        strict=True,
-    )
-    lines = "\n   ".join(f"{key}: {value}" for key, value in {**about, "stack": f"{max(stack)} bytes"}.items())
-    comment = "/* " + lines.replace("*/", "* /").replace("/*", "/ *") + " */\n"
-    macro = name.upper()
-    parameter = f", const double p[{macro}_PARAMETERS]" if "p" in law.arguments else ""
-    control = f"void {name}_control(double t, const double x[{macro}_STATES]{parameter}, double u[{macro}_CONTROLS])"
-    value = f"double {name}_value(double t, const double x[{macro}_STATES]{parameter})"
-    given = ", ".join("&t" if argument == "t" else argument for argument in law.arguments)
-    entries = (
-        f"{control}\n{{\n    control_of({given}, u);\n}}\n\n"
-        f"{value}\n{{\n    double V[1];\n    value_of({given}, V);\n    return V[0];\n}}\n"
-    )
-    code, includes = "\n".join(functions), '#include "policy.h"\n\n#include <math.h>\n'
+    bodies, sizes = list[str](), dict[str, int]()
+    for result, graph in (("control", law.control), ("value", law.value)):
+        signature = f"static void {result}_of({arrays}double *y)"
+        body, sizes[result] = c_function(signature, graph, law.arguments, ["y"], tables)
+        bodies.append(body)
+    entries, stack = _entries(controller, law, style, tried), max(sizes.values())
+    if loop is not None:
+        further, size = loop.functions(tables)
+        bodies.append(further)
+        entries, stack = entries + loop.entries(style, tried), max(stack, size)
+    made = "\n".join([*bodies, entries])
+    code = "\n".join(['#include "policy.h"\n\n#include <math.h>\n', *helpers(made), *tables.text, made])
+    sized = {**facts, "tables": f"{style.size * tables.count} bytes", "stack": f"{style.size * stack} bytes of arrays"}
     return {
-        "policy.h": comment + _header(controller, law, macro, control, value),
-        "policy.c": "\n".join([comment + includes, *helpers(code), *tables.text, code, entries]),
-        "main.c": _example(law, name),
-        "CMakeLists.txt": CMAKE.replace("@", "policy" if name == NAME else f"{name}_policy"),
+        "policy.h": file_comment(sized) + style.code(_header(controller, law, style, loop)),
+        "policy.c": file_comment(sized) + style.code(code),
+        "main.c": style.code(_example(law, style) if loop is None else loop.example(style)),
+        "CMakeLists.txt": CMAKE.replace("@", "policy" if style.name == NAME else f"{style.name}_policy"),
     }
 
 
-def _header(controller: Controller, law: Law, macro: str, control: str, value: str) -> str:
-    sizes = {"STATES": len(law.arguments["x"]), "CONTROLS": controller.system.m}
+def signatures(law: Law, style: Style) -> tuple[str, str]:
+    """The heads of the functions for u and for V."""
+    name, macro, real = style.name, style.macro, style.real
+    parameter = f", const {real} p[{macro}_PARAMETERS]" if "p" in law.arguments else ""
+    state = f"{real} t, const {real} x[{macro}_STATES]{parameter}"
+    return f"int {name}_control({state}, {real} u[{macro}_CONTROLS])", f"{real} {name}_value({state})"
+
+
+def numbers_of(values: Any) -> str:
+    """Numbers as an initialiser."""
+    return "{" + ", ".join(literal(float(value)) for value in values) + "}"
+
+
+def box_table(name: str, lower: Tensor, upper: Tensor) -> str:
+    """A box as a table of pairs."""
+    pairs = ", ".join(
+        f"{{{literal(low)}, {literal(high)}}}" for low, high in zip(lower.tolist(), upper.tolist(), strict=True)
+    )
+    return f"static const double {name}[{len(lower)}][2] = {{{pairs}}};\n"
+
+
+def limits_of(controller: Controller, style: Style) -> tuple[Tensor, Tensor] | None:
+    """The limits (m,) of the controls in the precision of a style, rounded inwards; None if there are none."""
+    controls = controller.controls
+    if not isinstance(controls, ControlBox):
+        return None
+    rounded = ControlBox(controls.lower.double().cpu(), controls.upper.double().cpu()).to(style.dtype)
+    m = controller.system.m
+    return rounded.lower.double().expand(m), rounded.upper.double().expand(m)
+
+
+def has_limits(controls: ControlSet, style: Style) -> bool:
+    """Whether u is moved into its limits once more: in single precision a limit is rounded, and may be passed."""
+    return style.single and isinstance(controls, ControlBox)
+
+
+INSIDE = """static int is_inside(int n, const double *x, const double (*box)[2])
+{
+    for (int i = 0; i < n; i++)
+        if (!(x[i] >= box[i][0] && x[i] <= box[i][1])) return 0;
+    return 1;
+}
+"""
+LIMIT = """
+static void limit(double *u)
+{
+    for (int i = 0; i < @M; i++) u[i] = u[i] < limits[i][0] ? limits[i][0] : u[i] > limits[i][1] ? limits[i][1] : u[i];
+}
+"""
+FINITE = """static int is_finite(int n, const double *x)
+{
+    for (int i = 0; i < n; i++)
+        if (!isfinite(x[i])) return 0;
+    return 1;
+}
+"""
+
+
+def _entries(controller: Controller, law: Law, style: Style, tried: Points) -> str:
+    """The functions that others call, with the boxes that they look at."""
+    n, box, domain = len(law.arguments["x"]), controller.initial_states, controller.problem.domain
+    tables = [box_table("known", tried.lower, tried.upper), box_table("start", box.lower[:n], box.upper[:n])]
+    given = ", ".join("&t" if argument == "t" else argument for argument in law.arguments)
+    lines = [f"control_of({given}, u);"]
+    limits = limits_of(controller, style)
+    if limits is not None and has_limits(controller.controls, style):
+        tables.append(box_table("limits", *limits) + LIMIT.replace("@M", str(controller.system.m)))
+        lines.append("limit(u);")
+    lines.append(f"int code = is_finite({controller.system.m}, u) ? 0 : {style.macro}_NOT_FINITE;")
+    parameters = f" || !is_inside({len(tried.lower) - n}, p, known + {n})" if "p" in law.arguments else ""
+    lines.append(f"if (!is_inside({n}, x, known){parameters}) code |= {style.macro}_OUTSIDE;")
+    lines.append(f"if (t <= 0 && !is_inside({n}, x, start)) code |= {style.macro}_OUTSIDE_X0;")
+    if domain is not None:
+        low, high = domain.narrowed(-SLACK)
+        tables.append(box_table("defined", low[:n], high[:n]))
+        lines.append(f"if (!is_inside({n}, x, defined)) code |= {style.macro}_OUTSIDE_DOMAIN;")
+    control, value = signatures(law, style)
+    return "\n".join([
+        *tables, INSIDE, FINITE,
+        f"{control}\n{{\n    " + "\n    ".join([*lines, "return code;"]) + "\n}\n",
+        f"{value}\n{{\n    double V[1];\n    value_of({given}, V);\n    return V[0];\n}}\n",
+    ])  # fmt: skip
+
+
+def _header(controller: Controller, law: Law, style: Style, loop: Any) -> str:
+    macro, n, box = style.macro, len(law.arguments["x"]), controller.initial_states
+    sizes = {"STATES": n, "CONTROLS": controller.system.m}
     if "p" in law.arguments:
         sizes["PARAMETERS"] = len(law.arguments["p"])
-    defines = "".join(f"#define {macro}_{name} {size}\n" for name, size in sizes.items())
+    if loop is not None:
+        sizes |= {"READINGS": loop.readings, "ESTIMATED": loop.estimated}
+        sizes |= {"SETTINGS": loop.settings} if loop.settings else {}
+    numbers = {"DT": literal(controller.horizon.dt), "T": literal(controller.horizon.duration)}
+    numbers |= {"X0_LOWER": numbers_of(box.lower[:n]), "X0_UPPER": numbers_of(box.upper[:n])}
+    if (limits := limits_of(controller, style)) is not None and all(bool(side.isfinite().all()) for side in limits):
+        numbers |= {"U_LOWER": numbers_of(limits[0]), "U_UPPER": numbers_of(limits[1])}
+    defines = "".join(f"#define {macro}_{key} {text}\n" for key, text in (sizes | numbers).items())
+    bits = {key: entry for key, entry in vars(Bits).items() if key.isupper() and (loop is not None or key != "MISSING")}
+    codes = "".join(f"#define {macro}_{key} {number}  /* {what} */\n" for key, (number, what) in bits.items())
+    control, value = signatures(law, style)
     return (
-        f"#ifndef {macro}_POLICY_H\n#define {macro}_POLICY_H\n\n{defines}\n"
+        f"#ifndef {macro}_POLICY_H\n#define {macro}_POLICY_H\n\n{defines}\ntypedef double {style.real};\n\n"
+        f"/* What functions return: 0, or the sum of */\n{codes}\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif\n\n/* u(t, x) */\n{control};\n\n/* V(t, x) */\n{value};\n\n'
+        f"{'' if loop is None else loop.declarations(style)}"
         "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
     )
 
@@ -88,16 +249,17 @@ endif()
 """  # @: the library; as a part of another project it is that alone
 
 
-def _example(law: Law, name: str) -> str:
+def _example(law: Law, style: Style) -> str:
     """A program that asks for u and V at a state of X₀."""
+    name, macro, real = style.name, style.macro, style.real
     lists = {one: ", ".join(map(literal, law.arguments[one].tolist())) for one in law.arguments if one != "t"}
-    arrays = "".join(f"    const double {one}[] = {{{numbers}}};\n" for one, numbers in lists.items())
-    given, controls = ", ".join(lists), f"{name.upper()}_CONTROLS"
+    arrays = "".join(f"    const {real} {one}[] = {{{numbers}}};\n" for one, numbers in lists.items())
+    given, controls = ", ".join(lists), f"{macro}_CONTROLS"
     return (
         '#include <stdio.h>\n#include "policy.h"\n\nint main(void)\n{\n'
-        f"{arrays}    double u[{controls}];\n    {name}_control(0.0, {given}, u);\n"
+        f"{arrays}    {real} u[{controls}];\n    {name}_control(0, {given}, u);\n"
         f'    for (int i = 0; i < {controls}; i++) printf("u[%d] = %g\\n", i, u[i]);\n'
-        f'    printf("V = %g\\n", {name}_value(0.0, {given}));\n    return 0;\n}}\n'
+        f'    printf("V = %g\\n", {name}_value(0, {given}));\n    return 0;\n}}\n'
     )
 
 
@@ -116,6 +278,18 @@ def compile_c(source: Sequence[Path], result: Path, options: Sequence[str]) -> N
         raise ExportError(f"Expected C that {' '.join(options)} takes, got: {done.stderr.strip()[:300]}")
 
 
+def library_of(sources: Sequence[Path], options: Sequence[str]) -> ctypes.CDLL:
+    """C files as machine code of this process.
+
+    Raises:
+        ExportError: as compile_c.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        library = Path(place) / "policy.so"
+        compile_c(sources, library, [*options, "-shared", "-fPIC"])
+        return ctypes.CDLL(str(library))
+
+
 class CompiledLaw:
     """A controller's law as machine code of this process, for one state at a time: microseconds, not milliseconds.
 
@@ -124,23 +298,30 @@ class CompiledLaw:
         law: of which it is.
         controls: m.
         options: for the compiler.
-        name: as in `sources`.
+        style: as in `sources`.
+        functions: the source, if it is compiled already.
 
     Raises:
         ExportError: as compile_c.
     """
 
-    def __init__(self, folder: Path, law: Law, controls: int, options: Sequence[str], name: str = NAME):
-        with tempfile.TemporaryDirectory() as place:
-            library = Path(place) / "policy.so"
-            compile_c([folder / "policy.c"], library, [*options, "-shared", "-fPIC"])
-            functions = ctypes.CDLL(str(library))
+    def __init__(
+        self,
+        folder: Path,
+        law: Law,
+        controls: int,
+        options: Sequence[str],
+        style: Style = Style(),
+        functions: ctypes.CDLL | None = None,
+    ):
+        functions = library_of([folder / "policy.c"], options) if functions is None else functions
         self.parameters = len(law.arguments.get("p", ()))
-        self.states, self.controls = len(law.arguments["x"]), controls
+        self.states, self.controls, self._style = len(law.arguments["x"]), controls, style
+        number = ctypes.c_float if style.single else ctypes.c_double
         arrays = [ctypes.c_void_p] * (len(law.arguments) - 1)
-        self._control, self._value = functions[f"{name}_control"], functions[f"{name}_value"]
-        self._control.argtypes, self._control.restype = [ctypes.c_double, *arrays, ctypes.c_void_p], None
-        self._value.argtypes, self._value.restype = [ctypes.c_double, *arrays], ctypes.c_double
+        self._control, self._value = functions[f"{style.name}_control"], functions[f"{style.name}_value"]
+        self._control.argtypes, self._control.restype = [number, *arrays, ctypes.c_void_p], ctypes.c_int
+        self._value.argtypes, self._value.restype = [number, *arrays], number
 
     def policy(self, t: float, x: ArrayLike) -> NDArray:
         """u(t, x): x (n,), or (x, p) of a family; returns (m,). t below 0 counts as 0.
@@ -148,9 +329,13 @@ class CompiledLaw:
         Raises:
             ValueError: another shape.
         """
-        state, u = self._state(x), np.empty(self.controls)
-        self._control(t, *self._places(state), u.ctypes.data)
-        return u
+        return self.policy_and_code(t, x)[0]
+
+    def policy_and_code(self, t: float, x: ArrayLike) -> tuple[NDArray, int]:
+        """(u(t, x), what the function returns: 0, or a sum of numbers of Bits) likewise."""
+        state, u = self._state(x), np.empty(self.controls, self._style.numpy)
+        code = self._control(t, *self._places(state), u.ctypes.data)
+        return u, code
 
     def value(self, t: float, x: ArrayLike) -> float:
         """V(t, x) likewise."""
@@ -158,15 +343,15 @@ class CompiledLaw:
         return self._value(t, *self._places(state))
 
     def _state(self, x: ArrayLike) -> NDArray:
-        state, size = np.ascontiguousarray(x, dtype=np.float64), self.states + self.parameters
+        state, size = np.ascontiguousarray(x, dtype=self._style.numpy), self.states + self.parameters
         if state.shape != (size,):
             raise ValueError(f"Expected x of shape ({size},), one state, got {state.shape}; ask for one after another.")
         return state
 
     def _places(self, state: NDArray) -> tuple[int, ...]:
-        """Where x, and p, begin; a double has 8 bytes."""
+        """Where x, and p, begin."""
         start = state.ctypes.data
-        return (start, start + 8 * self.states) if self.parameters else (start,)
+        return (start, start + state.itemsize * self.states) if self.parameters else (start,)
 
     def of_many(self, t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
         """u (k, m) and V (k,) at t (k,) and x (k, n)."""

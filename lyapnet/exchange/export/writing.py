@@ -6,20 +6,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from lyapnet import __version__
-from lyapnet.base.errors import UsageError
-from lyapnet.base.files import digest_of_file, write_atomically
-from lyapnet.controller.controller import Controller
-from lyapnet.exchange.export import c, programs
-from lyapnet.exchange.export.law import Law
-from lyapnet.exchange.export.verification import Agreement, verify
-from lyapnet.value.law_after_horizon import BEYOND
+import torch
 
-FORMATS = {"c": "", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
+from lyapnet.base.errors import UsageError
+from lyapnet.base.files import write_atomically
+from lyapnet.controller.controller import Controller
+from lyapnet.controller.output_feedback import OutputFeedback
+from lyapnet.exchange.export import c, fmu, programs
+from lyapnet.exchange.export.c_loop import CompiledLoop, LoopTraces, verify_loop
+from lyapnet.exchange.export.facts import facts_of
+from lyapnet.exchange.export.law import Law
+from lyapnet.exchange.export.verification import Agreement, points, verify
+
+FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
+IN_C = ("c", "fmu")
 PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
 }
+
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}  # of the numbers in C
 
 
 class Exported(NamedTuple):
@@ -30,72 +37,122 @@ class Exported(NamedTuple):
 
 
 def export(
-    controller: Controller, path: str | Path, to: str, checkpoint: Path | None = None, name: str = c.NAME
+    exported: Controller | OutputFeedback,
+    path: str | Path,
+    to: str,
+    checkpoint: Path | None = None,
+    name: str = c.NAME,
+    dtype: str = "float64",
+    fmi: str = "2.0",
 ) -> Exported:
-    """Write u(t, x) and V(t, x) of a controller for use without lyapnet.
+    """Write u(t, x) and V(t, x) of a controller for use without lyapnet; in C also its loop with an estimator.
 
     Limits, target, parameters of a family and what follows T are inside; t below 0 counts as 0. What is written is run
-    on 10 000 states and held against the controller; where they differ by more than rounding, nothing is kept.
+    on 10 000 states and held against the controller, a loop over 10 000 steps; where they differ by more than rounding,
+    nothing is kept.
 
     Args:
-        path: of a folder for c, of a file for onnx and torch.
-        to: a key of FORMATS: c, C99 without a library; onnx, a model (t, x[, p]) ↦ (u, V) of one state; torch, the
-            same for torch.export.load.
+        exported: a controller; or a controller with its estimator, of controller.with_estimator("ekf").
+        path: of a folder for c, of a file for the others.
+        to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; onnx, a model
+            (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load.
         checkpoint: that the controller was loaded from, whose digest is then noted.
         name: what the names in C begin with: several laws in one program need several.
+        dtype: of the numbers in C, float64 or float32.
+        fmi: the version of a unit's interface, 2.0 or 3.0.
 
     Raises:
-        UsageError: another format, a place that cannot be written to, or a name that is none in C.
+        UsageError: another format, dtype or version, a place that cannot be written to, or a name that is none in C.
         ExportError: the law cannot be written in it, or what was written is not that law.
     """
     path = Path(path)
     _require_place(path, to)
     _require_name(name, to, path)
-    about, law = _about(controller, checkpoint), Law(controller)
+    _require_dtype(dtype, to)
+    if fmi not in fmu.VERSIONS:
+        raise UsageError(f"Expected fmi as one of {', '.join(fmu.VERSIONS)}, got {fmi!r}; choose one of them.")
+    loop = exported if isinstance(exported, OutputFeedback) else None
+    controller = exported.controller if isinstance(exported, OutputFeedback) else exported
+    if controller is None:
+        raise UsageError(
+            "Expected an estimator of controller.with_estimator, got another one; its controller is needed."
+        )
+    if loop is not None and to not in IN_C:
+        raise UsageError(
+            f"Expected an estimator with --to {' or '.join(IN_C)}, got {to}; the others have the law alone."
+        )
+    facts, law = facts_of(controller, checkpoint), Law(controller)
     try:
         place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
     except OSError as error:
         raise UsageError(f"Expected a place that can be written to, got {str(path)!r} ({error.strerror}).") from error
     with place as folder:
         draft = Path(folder)
-        if to == "c":
-            return _write_c(controller, law, about, draft, path, name)
+        if to in IN_C:
+            style = c.Style(name, DTYPES[dtype])
+            written = _Written(controller, law, facts, style, loop)
+            return _write_c(written, draft, path) if to == "c" else _write_fmu(written, draft, path, fmi)
         make, write, run = PROGRAMS[to]
         made, file = make(law), draft / path.name
-        write(made, file, about)
+        write(made, file, facts)
         agreement = verify(controller, run(file, law))
-        write(made, file, {**about, "verified": str(agreement)})
+        write(made, file, {**facts, "verified": str(agreement)})
         write_atomically(path, file.read_bytes())
     return Exported([path], agreement)
 
 
 def compiled(controller: Controller) -> c.CompiledLaw:
-    """A controller's law as machine code, for a loop in Python: `.policy(t, x)` and `.value(t, x)` of one state.
+    """A controller's law as machine code of this process, for a loop in Python: `.policy(t, x)` and `.value(t, x)`.
 
-    It is what `export` writes in C, held against the controller likewise.
+    It takes one state at a time. It is what `export` writes in C, held against the controller likewise.
 
     Raises:
         ExportError: as export.
     """
     with tempfile.TemporaryDirectory() as place:
-        return _verified(controller, Law(controller), {}, Path(place), c.FAST)[0]
+        return _Written(controller, Law(controller), {}, c.Style(), None).verified(Path(place), c.FAST)[0]
 
 
-def _verified(
-    controller: Controller, law: Law, about: dict[str, str], folder: Path, options: Sequence[str], name: str = c.NAME
-) -> tuple[c.CompiledLaw, Agreement]:
-    """The C of a law written into a folder, compiled, and held against the controller."""
-    for file, text in c.sources(controller, law, about, name).items():
-        (folder / file).write_text(text, encoding="utf-8")
-    compiled_law = c.CompiledLaw(folder, law, controller.system.m, options, name)
-    return compiled_law, verify(controller, compiled_law.of_many)
+class _Written:
+    """The C of a controller, and of a loop if there is one: text, and how far it is from the controller.
+
+    Args:
+        facts: what it is, in lines.
+        style: names and precision.
+        loop: the estimator around the law, if it is written too.
+    """
+
+    def __init__(
+        self, controller: Controller, law: Law, facts: dict[str, str], style: c.Style, loop: OutputFeedback | None
+    ):
+        self.controller, self.law, self.style, self.loop = controller, law, style, loop
+        self.traces = None if loop is None else LoopTraces(loop)
+        self.facts = facts if self.traces is None else {**facts, **self.traces.facts()}
+        self.tried = points(controller)
+
+    def sources(self, **more: str) -> dict[str, str]:
+        """File name ↦ text, with further facts."""
+        facts = {**self.facts, **more}
+        return c.sources(self.controller, self.law, facts, self.style, self.tried, self.traces)
+
+    def verified(self, folder: Path, options: Sequence[str]) -> tuple[c.CompiledLaw, Agreement]:
+        """The C written into a folder, compiled, and held against the controller."""
+        for file, text in self.sources().items():
+            (folder / file).write_text(text, encoding="utf-8")
+        functions = c.library_of([folder / "policy.c"], options)
+        law = c.CompiledLaw(folder, self.law, self.controller.system.m, options, self.style, functions)
+        agreement = verify(self.controller, law.of_many, self.tried, self.style.dtype)
+        if self.loop is None or self.traces is None:
+            return law, agreement
+        found = CompiledLoop(self.traces, functions, self.style)
+        return law, agreement._replace(loop=verify_loop(self.loop, found, self.style.dtype))
 
 
 def _require_name(name: str, to: str, path: Path) -> None:
     """Refuse what cannot begin a name in C, a name where there are none, and another one than an earlier export's."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
-    if to != "c" and name != c.NAME:
+    if to not in IN_C and name != c.NAME:
         raise UsageError(f"Expected no name for {to}, got {name!r}; the names in C alone have one.")
     header = path / "policy.h"
     if to == "c" and header.is_file() and f" {name}_control(" not in header.read_text(encoding="utf-8"):
@@ -103,6 +160,14 @@ def _require_name(name: str, to: str, path: Path) -> None:
             f"Expected a name as in {str(header)!r}, whose main.c and CMakeLists.txt stay, got {name!r}; "
             "give the same, or another folder."
         )
+
+
+def _require_dtype(dtype: str, to: str) -> None:
+    """Refuse another precision, and a choice where there is none."""
+    if dtype not in DTYPES:
+        raise UsageError(f"Expected a dtype among {', '.join(DTYPES)}, got {dtype!r}; choose one of them.")
+    if to not in IN_C and dtype != "float64":
+        raise UsageError(f"Expected no dtype for {to}, got {dtype}; it has that of the controller.")
 
 
 def _require_place(path: Path, to: str) -> None:
@@ -126,37 +191,24 @@ def _require_place(path: Path, to: str) -> None:
         raise UsageError(f"Expected a new folder, or that of an earlier export, got {str(path)!r}; choose another.")
 
 
-def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Path, folder: Path, name: str) -> Exported:
+def _write_c(written: _Written, draft: Path, folder: Path) -> Exported:
     """The files of a C library; in a folder that has them, those of the law alone."""
-    _, agreement = _verified(controller, law, about, draft, c.FLAGS, name)
+    _, agreement = written.verified(draft, c.FLAGS)
     folder.mkdir(exist_ok=True)
     paths = []
-    for file, text in c.sources(controller, law, {**about, "verified": str(agreement)}, name).items():
+    for file, text in written.sources(verified=str(agreement)).items():
         if file not in c.YOURS or not (folder / file).exists():
             paths.append(folder / file)
             write_atomically(paths[-1], text.encode())
     return Exported(paths, agreement)
 
 
-def _about(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
-    """What an export is, in lines for its metadata."""
-    system, T = controller.system, controller.horizon.duration
-    constants = set(system.constants)
-    states = [i for i in range(system.n) if i not in constants]
-    beyond = controller.law.beyond
-    about = {
-        "lyapnet": __version__,
-        "checkpoint": "none" if checkpoint is None else f"{checkpoint}, SHA-256 {digest_of_file(checkpoint)}",
-        "t": f"s, from 0 to {T:g}; after that {beyond}: {BEYOND[beyond]}",
-        "x": _named(system.state_names, system.state_units, states),
-        "u": _named(system.control_names, system.control_units, range(system.m)),
-    }
-    if constants:
-        about["p"] = _named(system.state_names, system.state_units, sorted(constants))
-    if controller.law.held:
-        about["Δt"] = f"u is made to be held for {controller.horizon.dt:g} s"
-    return about
-
-
-def _named(names: Sequence[str], units: Sequence[str], which: Sequence[int]) -> str:
-    return ", ".join(f"{names[i]} ({units[i]})" if units[i] else names[i] for i in which)
+def _write_fmu(written: _Written, draft: Path, path: Path, version: str) -> Exported:
+    """A unit for co-simulation."""
+    _, agreement = written.verified(draft, c.FLAGS)
+    variables = fmu.variables_of(written.controller, written.law, written.traces)
+    sources, file = written.sources(verified=str(agreement)), draft / path.name
+    looped, settings = written.traces is not None, 0 if written.traces is None else written.traces.settings
+    fmu.write_fmu(file, version, sources, variables, written.style, written.controller, looped, settings, draft)
+    write_atomically(path, file.read_bytes())
+    return Exported([path], agreement)

@@ -83,7 +83,9 @@ def latencies(controller: Controller, seconds: float, others: Mapping[str, Polic
         ExportError: the law cannot be written in C; or there is no compiler.
     """
     count = max(1, round(seconds * RATE))
-    t, x = (column[:: max(1, len(column) // STATES)][:STATES].double().cpu().numpy() for column in points(controller))
+    t, x = (
+        column[:: max(1, len(column) // STATES)][:STATES].double().cpu().numpy() for column in points(controller)[:2]
+    )
     t = np.minimum(t, controller.horizon.duration)
     found = []
     with tempfile.TemporaryDirectory() as place:

@@ -1,6 +1,7 @@
 """What is exported says what the controller says, in each language, without lyapnet; and nothing else is kept."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from lyapnet.base.files import digest_of_file
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.exchange.export import compiled, export
+from lyapnet.exchange.export.c import FLAGS, Bits, CompiledLaw, Style
+from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import STATES, points
 from lyapnet.graphs import c_rules
 from lyapnet.task.sets import ControlBox
@@ -46,10 +49,10 @@ def _few_steps():
         yield
 
 
-def controller_of(kind, beyond=None):
+def controller_of(kind, beyond=None, more=()):
     """A controller with random weights; none of them zero."""
     name, overrides = KINDS[kind]
-    controller = untrained(name, *SHORT, *overrides)
+    controller = untrained(name, *SHORT, *overrides, *more)
     with torch.no_grad():
         for parameter in controller.V.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
@@ -96,12 +99,28 @@ def test_in_python_it_is_one_state_after_another(kind):
         law.value(0.0, [0.0] * (len(x) - 1))
 
 
+@pytest.mark.gate
+@needs_compiler
+def test_a_code_says_where_the_law_was_not_compared():
+    controller = controller_of("a limit, held")
+    law, x0 = compiled(controller), controller.initial_states.upper
+    loop = controller.rollout(x0[None])
+    codes = [law.policy_and_code(float(t), x)[1] for t, x in zip(loop.t, loop.x[:, 0].numpy(), strict=True)]
+    assert not any(codes), "closed loops from X₀ are within"
+    far = (x0 + 1e3).tolist()
+    assert law.policy_and_code(0.1, far)[1] == Bits.OUTSIDE[0]
+    assert law.policy_and_code(0.0, far)[1] == Bits.OUTSIDE[0] + Bits.OUTSIDE_X0[0]
+    u, code = law.policy_and_code(0.1, [float("nan")] * len(x0))
+    assert code == Bits.OUTSIDE[0] + Bits.NOT_FINITE[0]
+    assert np.isnan(u).any()
+
+
 @needs_compiler
 @pytest.mark.parametrize("beyond", ["hold", "receding", "riccati"])
 def test_what_follows_T_is_inside(beyond, tmp_path):
     controller = controller_of("the HJB law", beyond)
     _, agreement = export(controller, tmp_path / "law", "c")
-    t, _ = points(controller)
+    t, *_ = points(controller)
     assert (t > controller.horizon.duration).any(), "they are among the states that it is held against"
     assert agreement.control < 1e-9
     assert beyond in (tmp_path / "law" / "policy.h").read_text()
@@ -122,7 +141,7 @@ def test_a_law_that_is_not_the_controllers_is_not_kept(rule, monkeypatch, tmp_pa
 def test_limits_hold_to_the_last_bit(tmp_path):
     controller = controller_of("a limit, held")
     export(controller, tmp_path / "law", "c")
-    t, x = points(controller)
+    t, x, *_ = points(controller)
     u = controller.policy(t, x)
     assert (u.abs() == 8).any()
     assert "larger(" in (text := (tmp_path / "law" / "policy.c").read_text())
@@ -217,6 +236,25 @@ def test_single_precision_is_exported_too(tmp_path):
     assert max(agreement.control, agreement.value) < 1e-4
 
 
+LIMITS = ("controls.lower=-0.1", "controls.upper=0.3")  # which no float is
+
+
+@pytest.mark.gate
+@needs_compiler
+@pytest.mark.parametrize("kind", ["a limit, held", "a family", "limits of four controls"])
+def test_numbers_in_c_may_be_floats(kind, tmp_path):
+    controller = controller_of(kind, more=LIMITS)
+    _, agreement = export(controller, tmp_path / "law", "c", dtype="float32", name="arm")
+    assert 1e-9 < max(agreement.control, agreement.value) < 1e-3
+    code = (tmp_path / "law" / "policy.c").read_text().split("*/", 1)[1]
+    assert not re.findall(r"\bdouble\b|\d\.\d+(?![\df e])|\b(?:sin|cos|exp|sqrt)\(", code)
+    law = CompiledLaw(tmp_path / "law", Law(controller), controller.system.m, FLAGS, Style("arm", torch.float32))
+    for far in (-10, -1, 1, 10):
+        u = law.policy(0.0, far * controller.initial_states.upper.numpy()).astype(float)
+        assert (u >= -0.1).all()
+        assert (u <= 0.3).all()
+
+
 @needs_compiler
 def test_files_of_the_users_own_are_kept(tmp_path):
     controller = own_controller(OWN["no time"], reads=False)
@@ -294,7 +332,13 @@ def test_names_do_not_get_out_of_their_comment(tmp_path):
     [
         (own_controller, "law", "c", ExportError, "reads the values"),
         (lambda: controller_of("the HJB law", "error"), "law", "c", ExportError, "beyond=error"),
-        (lambda: controller_of("the HJB law"), "law", "fortran", UsageError, "Expected a format among c, onnx, torch"),
+        (
+            lambda: controller_of("the HJB law"),
+            "law",
+            "fortran",
+            UsageError,
+            "Expected a format among c, fmu, onnx, torch",
+        ),
         (lambda: controller_of("the HJB law"), "law.bin", "torch", UsageError, "ends in .pt2"),
         (lambda: controller_of("the HJB law"), "none/law", "c", UsageError, "folder that exists"),
         (lambda: controller_of("the HJB law"), "file", "c", UsageError, "Expected a folder for c"),

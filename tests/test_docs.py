@@ -11,6 +11,8 @@ import pytest
 import yaml
 from omegaconf import MISSING
 
+from lyapnet.base import errors
+from lyapnet.cli import main
 from lyapnet.experiment.assembly import REGISTRIES
 from lyapnet.experiment.config import Config
 from lyapnet.experiment.recipe import STANDARD
@@ -207,3 +209,17 @@ def test_the_weights_that_programs_recommend_are_what_the_page_says():
     for name, program in PROGRAMS.items():
         weights = [f"`{key}: {json.dumps(value)}`" for key, value in program.recommended.items()]
         assert f"`{name}` {', '.join(weights[:-1])} and {weights[-1]}" in page
+
+
+def test_errors_name_sections_that_exist(tmp_path, capsys):
+    known = anchors(ROOT / "docs" / "troubleshooting.md")
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.LyapnetError)]
+    named = {kind.section for kind in kinds} - {""}
+    assert len(named) >= 4
+    assert named <= known
+    assert "no-such-section" not in known
+    (tmp_path / "broken.ckpt").write_bytes(b"no checkpoint")
+    assert main(["evaluate", str(tmp_path / "broken.ckpt")])
+    assert "docs/troubleshooting.md#a-checkpoint-is-refused" in capsys.readouterr().err
+    assert main(["evaluate", "--no-such-option"])
+    assert "troubleshooting" not in capsys.readouterr().err

@@ -71,6 +71,7 @@ class LyapnetError(Exception):
     """A failure with a message meant for the user; the command line prints it and exits with `exit_status`."""
 
     exit_status = 1
+    section = ""  # of docs/troubleshooting.md, which the command line names
 
 
 class UsageError(LyapnetError, ValueError):
@@ -82,9 +83,13 @@ class UsageError(LyapnetError, ValueError):
 class CheckpointError(LyapnetError):
     """A checkpoint cannot be read, written, or used for the request."""
 
+    section = "a-checkpoint-is-refused"
+
 
 class DivergenceError(LyapnetError):
     """A rollout, a loss term or a gradient is not finite."""
+
+    section = "training-diverges"
 
 
 class CompilationError(LyapnetError):
@@ -98,9 +103,13 @@ class UntraceableError(CompilationError):
 class ExportError(LyapnetError):
     """A control law cannot be exported, or the exported law differs from it."""
 
+    section = "an-export-is-refused"
+
 
 class OracleError(LyapnetError):
     """There is no optimum for a task; measures without the optimum can still be reported."""
+
+    section = "no-optimum"
 
 
 class Interrupted(BaseException):

@@ -103,7 +103,8 @@ def _is_closed_output(error: BaseException) -> bool:
 def _explain(error: Any) -> tuple[str, int]:
     """One line and the exit status for an exception that reached the user."""
     if isinstance(error, LyapnetError):
-        return f"error: {' '.join(str(error).split())}", error.exit_status
+        more = f" More: docs/troubleshooting.md#{error.section}" if error.section else ""
+        return f"error: {' '.join(str(error).split())}{more}", error.exit_status
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)
         command, got = getattr(context, "command_path", "lyapnet"), " ".join(error.format_message().split())

@@ -16,6 +16,7 @@ from lyapnet.controller.loading import load
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.proof import Progress
 
+SAMPLED = ("sampled", "statistical")  # claims about closed loops, whatever their goal
 NOTHING_KEPT = "Stopped while certifying: the proof of a {} cannot be kept."
 
 
@@ -65,6 +66,11 @@ def certify(
         run.require_used_by(claim)
         if not claim.allows_noise:
             require_no_noise(controller.problem, claim.kind)
+        if controller.problem.follows_reference and claim.kind not in SAMPLED:
+            raise UsageError(
+                f"Expected a goal that stays for a {claim.kind} certificate, got a reference; {' and '.join(SAMPLED)} "
+                "certificates take one."
+            )
     if len(claims) == 1:
         certificate = claims[0].establish(controller, run)
     elif len(above) == len(below) == 1 and above[0].share_of_two is not None:

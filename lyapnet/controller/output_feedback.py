@@ -16,6 +16,7 @@ from lyapnet.task.family import LOGARITHM
 from lyapnet.task.input_disturbances import DisturbedSystem
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
+from lyapnet.task.reference import TIME
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 
 ROUNDING = 1e-6  # by which a setting may exceed its range, relative to it: a problem in float32 has rounded ends
@@ -78,7 +79,7 @@ class OutputFeedback:
             ValueError: a shape does not fit, a number is not finite, or P is not symmetric positive semidefinite.
         """
         n = self.problem.system.n
-        first = self.problem.initial_states.center if x_hat is None else _float64(x_hat)
+        first = self.middle_estimate() if x_hat is None else _float64(x_hat)
         covariance = torch.diag(self.deviation.square()) if P is None else _float64(P)
         if first.ndim < 1 or first.shape[-1] != n:
             names = ", ".join(self.problem.system.state_names)
@@ -94,6 +95,11 @@ class OutputFeedback:
             raise ValueError(f"Expected finite x_hat and t, got {first.tolist()} and {t}; give numbers.")
         self._belief, self._u, self._t, self._began = Belief(first, covariance), None, float(t), 0.0
         self._like: Any = x_hat if x_hat is not None else np.empty(0)
+
+    def middle_estimate(self) -> State:
+        """The centre of X₀, at the beginning of a reference."""
+        system, box = self.problem.system, self.problem.initial_states
+        return torch.where(torch.tensor([name == TIME for name in system.state_names]), box.lower, box.center)
 
     def draw_first(self, x0: State, generator: torch.Generator) -> State:
         """A first estimate for each x₀: the centre of X₀, or around x₀ in states that X₀ fixes.

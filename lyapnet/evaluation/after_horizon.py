@@ -59,11 +59,12 @@ def _follow(controller: Controller, beyond: str, x0: State, steps: int) -> Loops
 def share_at_goal(controller: Controller, x0: State) -> float | None:
     """The share of closed loops that the law after T keeps near the goal up to MULTIPLE T; None where it is undefined.
 
-    It is undefined without a goal, without a law after T, and beyond LONGEST steps. If a closed loop diverges, or f, g
-    or the cost raise an error, the share is 0.
+    It is undefined without a goal that stays, without a law after T, and beyond LONGEST steps. If a closed loop
+    diverges, or f, g or the cost raise an error, the share is 0.
     """
     steps = MULTIPLE * controller.horizon.steps
-    if steps > LONGEST or not controller.problem.has_goal or controller.law.beyond == "error":
+    stays = controller.problem.has_goal and not controller.problem.follows_reference
+    if steps > LONGEST or not stays or controller.law.beyond == "error":
         return None
     try:
         x = controller.continued(controller.law.beyond).rollout(x0, steps).x

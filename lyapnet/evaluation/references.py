@@ -47,12 +47,14 @@ def costs_of_plant(problem: Problem, policy: nn.Module, x0: State) -> PerState:
 def costs_of_lqr(problem: Problem, x0: State, increments: Increments | None = None) -> PerState | None:
     """The costs of LQR: u = ū_n + K_n(x − x*) of the problem linearised at its goal, over N steps, projected onto U.
 
-    None if there is no goal or no finite linearisation there, or if the limits of U are unknown.
+    None if there is no goal, or one that moves with a reference, or no finite linearisation there, or if the limits of
+    U are unknown.
 
     Args:
         increments: ΔW of each step; None: without noise.
     """
-    law = _lqr(problem) if problem.has_goal and problem.controls.limits is not None else None
+    stays = problem.has_goal and not problem.follows_reference
+    law = _lqr(problem) if stays and problem.controls.limits is not None else None
     if law is None:
         return None
     drawn = None if increments is None else increments.double().cpu()

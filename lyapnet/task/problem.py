@@ -25,6 +25,7 @@ from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.task.noise import Noise, SystemNoise
+from lyapnet.task.reference import TIME
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -120,6 +121,11 @@ class Problem(nn.Module):
     def has_goal(self) -> bool:
         """Whether q and φ vanish at the cost's goal, or else at the origin, and are nowhere negative."""
         return not self.no_goal
+
+    @property
+    def follows_reference(self) -> bool:
+        """Whether the goal moves with the time on a reference, which is a state."""
+        return TIME in self.system.state_names
 
     @property
     def no_goal(self) -> str:

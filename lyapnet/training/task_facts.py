@@ -82,6 +82,8 @@ def facts_of(
             tell(_noise_fact(exact, exact.noise))
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
+        elif exact.follows_reference:
+            tell(Fact("reference", "followed at no cost by the control that the cost counts u from"))
         elif (around := linearised(exact)).missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:

@@ -56,6 +56,8 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
     """
     if not problem.has_goal:
         return AfterHorizon("hold", 0, 0, "the task has no goal")
+    if problem.follows_reference:
+        return AfterHorizon("receding", 0, 0, "the task follows a reference")
     if MULTIPLE * problem.horizon.steps > LONGEST:
         return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))

@@ -9,9 +9,13 @@ from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import UsageError
+from lyapnet.evaluation.after_horizon import share_at_goal
 from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.evaluation.references import costs_of_lqr
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain, load_config
+from lyapnet.lab.comparison.planners.feedback import Regulator, Rest
+from lyapnet.lab.comparison.planners.mpc import PredictiveControl
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import riccati
 from tests.problems import problem_of
@@ -123,6 +127,28 @@ def test_an_estimator_knows_the_time_on_the_reference():
     assert_close(loop.P[2], np.zeros(3))
 
 
+def test_what_is_about_a_goal_that_stays_is_left_out_or_refused():
+    task = problem()
+    controller = lyapnet.Controller(task, Clock(), policy=lyapnet.HJBPolicy)
+    assert controller.after_horizon().beyond == "receding"
+    assert share_at_goal(controller, task.initial_states.sample(2)) is None
+    assert costs_of_lqr(task, task.initial_states.sample(2)) is None
+    with pytest.raises(UsageError, match="a goal that stays for a sound certificate, got a reference"):
+        lyapnet.certify(controller, lyapnet.Funnel(alpha=0.5))
+    with pytest.raises(UsageError, match="a goal that stays for lqr"):
+        Regulator(task)
+    z, u = on_reference(torch.tensor([0.3]))
+    assert_close(torch.from_numpy(Rest(task).law()(0, z[0].numpy())), u[0], atol=0.05, rtol=0)
+    assert not PredictiveControl(task, 10)._tail.hessian.any()
+    assert PredictiveControl(problem(reference={}), 10)._tail.hessian.any()
+
+
+def test_an_estimator_begins_at_the_beginning():
+    config = config_from_plain({**TASK, "outputs": {"measure": ["position"], "noise": 0.01}})
+    controller = lyapnet.Controller(build_problem(config), Clock(), policy=lyapnet.HJBPolicy, config=config)
+    assert controller.with_estimator().x_hat[2] == 0
+
+
 def test_what_no_control_follows_needs_a_control_to_count_from(caplog):
     """A cart-pole cannot follow a sine with its pole upright."""
     followed = {"t": SINE["t"], "cart position": SINE["position"]}
@@ -149,6 +175,12 @@ def points(**changes):
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
+        ({"reference": {"periodic": True}}, "reference.file or reference.points, got neither"),
+        ({"reference": {"file": "r.csv"}}, "got reference.file 'r.csv', which is read where a YAML file is loaded"),
+        (points(position=[math.nan, *SINE["position"][1:]]), "finite numbers in reference"),
+        (points(t=[*SINE["t"][:-1], math.inf]), "finite numbers in reference"),
+        (points(**{"cart_position": SINE["position"], "cart position": SINE["position"]}), "each state once"),
+        ({"reference": {"points": SINE, "periodic": True, "speed": 50}}, "a reference of 8 steps"),
         (points(t=[0.0, 1.0]), "three or more rising times"),
         (points(t=[0.1, *SINE["t"][1:]]), "three or more rising times from 0"),
         (points(t=SINE["t"][::-1]), "three or more rising times"),

@@ -145,12 +145,16 @@ def test_the_law_of_V_minimises_over_u_counted_from_that_of_each_member():
 @pytest.mark.parametrize(
     ("base", "changes", "reason"),
     [
-        (HELD_AT_ANGLES, {"controls": {"lower": -5, "upper": 5}}, "among those that are admitted"),
+        (
+            HELD_AT_ANGLES,
+            {"controls": {"lower": -5, "upper": 5}},
+            "within limits that hold the target of target_angle = ",
+        ),
         (HELD_AT_ANGLES, {"family": {"target_velocity": [-1, 1]}}, "target that some control holds"),
         (HELD_AT_ANGLES, {"target": [0, 1], "family": {"target_angle": [-1, 1]}}, "target that some control holds"),
         (TANKS, {"family": {"target_lower": [-0.2, 0.6]}}, "target that some control holds|are finite"),
         (TANKS, {"family": {"target_lower": [1e-9, 0.6]}}, "smooth in target_lower|some control holds"),
-        (TANKS, {"controls": {"lower": 0, "upper": 0.8}}, "among those that are admitted"),
+        (TANKS, {"controls": {"lower": 0, "upper": 0.8}}, "hold the target of target_lower = "),
         (TANKS, {"target_control": [0], "target": {"lower": 0.3}}, "every state with target_control"),
     ],
 )

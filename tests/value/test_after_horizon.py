@@ -373,7 +373,7 @@ def test_the_regulator_of_a_family_is_that_of_each_member():
     generator = torch.Generator().manual_seed(1)
     for z in problem.initial_states.sample(4, generator).double():
         p = z[list(system.constants)]
-        own, parts, _ = member(config, Parts(), system, dict(zip(config.family, p.tolist(), strict=True)))
+        own, parts, _ = member(config, Parts(), problem, dict(zip(config.family, p.tolist(), strict=True)))
         expected = Regulator(build_problem(own, parts), spread=True)
         offset = 0.1 * torch.randn(5, system.system.n, generator=generator, dtype=torch.float64)
         x = expected.problem.goal + offset

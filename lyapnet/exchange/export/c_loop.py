@@ -51,7 +51,7 @@ class LoopTraces:
         self.loop, problem = loop, loop.problem
         self.readings, self.estimated, self.controls = loop.outputs.count, problem.system.n, problem.system.m
         self.settings = len(loop.settings)
-        x, P = problem.initial_states.center, torch.diag(loop.deviation.square())
+        x, P = loop.middle_estimate(), torch.diag(loop.deviation.square())
         u, y, t = problem.rest.double(), loop.outputs(x), torch.zeros((), dtype=torch.float64)
         law, like = loop.law, loop.state_of_law
 
@@ -154,10 +154,11 @@ class LoopTraces:
         name, macro, real = style.name, style.macro, style.real
         centre = self.loop.problem.initial_states.center
         y, settings = numbers_of(self.loop.outputs(centre)), "r, " if self.settings else ""
-        r = numbers_of(centre[list(self.loop.settings.values())])
+        r = numbers_of(torch.full((self.settings,), torch.nan))  # they stay as they are
         declared = f"    const {real} r[{macro}_SETTINGS] = {r};\n" if self.settings else ""
         return (
-            '#include <stdio.h>\n#include "policy.h"\n\nint main(void)\n{\n'
+            f'{"#include <math.h>" + chr(10) if self.settings else ""}#include <stdio.h>\n#include "policy.h"\n\n'
+            "int main(void)\n{\n"
             f"    const {real} y[{macro}_READINGS] = {y};\n{declared}    {real} u[{macro}_CONTROLS];\n"
             f"    {name}_loop loop;\n"
             f"    {name}_reset(&loop);\n    for (int k = 0; k < 5; k++) {{\n"
@@ -237,7 +238,8 @@ CHANGE = """    static const int which[@K] = {@WHICH};
     }
 """
 SETTINGS_SAY = """
-   r: where one changes the horizon begins anew; if NaN or outside of its range it stays, at first in the middle."""
+   r: where one changes the horizon begins anew; if NaN or outside of its range it stays, at first in the middle.
+   The time on a reference runs by itself from 0: give it where it jumps, and NaN otherwise."""
 
 
 class CompiledLoop:

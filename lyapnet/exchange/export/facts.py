@@ -36,7 +36,9 @@ def facts_of(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
     if isinstance(problem.controls, ControlBox):
         low, high = (side.expand(system.m) for side in (problem.controls.lower, problem.controls.upper))
         facts["limits"] = _ranges(system.control_names, system.control_units, low, high, range(system.m))
-    if problem.has_goal:
+    if problem.follows_reference:
+        facts["target"] = "a reference"
+    elif problem.has_goal:
         goal, rest = problem.goal.tolist(), problem.rest.tolist()
         held = _values(system.control_names, system.control_units, rest, range(system.m))
         facts["target"] = f"{_values(names, units, goal, states)}; held by {held}"

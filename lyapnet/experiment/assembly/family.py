@@ -142,7 +142,9 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
                 f"Expected parameters in {key} other than {', '.join(RESERVED_NAMES)}, got {name}; rename it."
             )
         if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
-            raise UsageError(f"Expected {key}.{name} as [least, greatest], got {bounds}; give two finite numbers.")
+            raise UsageError(
+                f"Expected {key}.{name} as [least, greatest], got {bounds}; give two finite numbers, the least first."
+            )
     return dict(ranges)
 
 

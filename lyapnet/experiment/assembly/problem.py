@@ -20,7 +20,7 @@ from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
 from lyapnet.experiment.assembly.noise import build_noise, check_risk
 from lyapnet.experiment.assembly.outputs import estimator_parts
-from lyapnet.experiment.assembly.reference import reference_of
+from lyapnet.experiment.assembly.reference import reference_of, require_points
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
@@ -73,6 +73,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
+        require_points(config.reference)
         if config.reference.points:
             system, cost, initial_states = reference_of(config, system, cost, controls, initial_states)
         elif config.family:

@@ -11,7 +11,7 @@ from lyapnet.base.interpolation import Basis, ChebyshevProducts, FourierSeries
 from lyapnet.base.linear_algebra import apply
 from lyapnet.experiment.assembly.entries import repeated, require_length
 from lyapnet.experiment.assembly.target import log_once
-from lyapnet.experiment.config import Config
+from lyapnet.experiment.config import Config, ReferenceConfig
 from lyapnet.task.cost import Cost, MadeOfAnother, TargetCost, innermost
 from lyapnet.task.family import FamilyCost, InterpolatedTargets
 from lyapnet.task.problem import TRIED
@@ -24,6 +24,7 @@ COUNTS = (9, 17, 33, 65, 129)  # numbers of functions that r is a sum of; the fi
 ACCURATE = 1e-4  # largest distance of r from the given points, relative to the extent of each state
 CLOSED = 1e-3  # largest distance between the first and the last point of a periodic reference, likewise
 MOST_AWAY = 0.02  # largest distance with the last of COUNTS
+LEAST_STEPS = 8  # fewest steps in which a reference is gone through
 BETWEEN = 4  # times between two points at which rates are compared
 FOLLOWED = 1e-2  # largest rate that u_r leaves, relative to the largest one of that state along r
 ADVICE = "give columns for other states, or say what the cost counts u from, as in reference.control: [0]"
@@ -68,6 +69,17 @@ def reference_of(
     return timed, FamilyCost(TargetCost(cost, x, u), targets, start, system.n), box
 
 
+def require_points(reference: ReferenceConfig) -> None:
+    """Refuse a reference that says something, but has no points; those of a file are read with the YAML."""
+    if reference.file:
+        raise UsageError(
+            f"Expected reference.points, got reference.file {reference.file!r}, which is read where a YAML file is "
+            "loaded; give the points, or lyapnet.experiment.config.load_config(PATH)."
+        )
+    if not reference.points and reference != ReferenceConfig():
+        raise UsageError("Expected reference.file or reference.points, got neither; give one, or leave the rest out.")
+
+
 class _Curve:
     """y(τ) = Σ c_k b_k(τ), with the functions b_k of a basis."""
 
@@ -91,6 +103,10 @@ def _points_of(config: Config, system: ControlAffineSystem) -> tuple[np.ndarray,
     """
     reference, duration = config.reference, config.horizon.steps * config.horizon.dt
     points = {name.replace("_", " "): np.array(column) for name, column in reference.points.items()}
+    if len(points) < len(reference.points):
+        raise UsageError(f"Expected each state once in reference, got {', '.join(reference.points)}; leave one out.")
+    if infinite := [name for name, column in points.items() if not np.isfinite(column).all()]:
+        raise UsageError(f"Expected finite numbers in reference, got others for {infinite[0]}; correct them.")
     times = points.pop("t", np.empty(0)) / reference.speed
     if len(times) < 3 or times[0] != 0 or not (np.diff(times) > 0).all():
         raise UsageError("Expected reference.points.t as three or more rising times from 0, got others; correct them.")
@@ -116,6 +132,11 @@ def _points_of(config: Config, system: ControlAffineSystem) -> tuple[np.ndarray,
         raise UsageError(
             f"Expected a reference as long as the horizon, {duration:g} s, got {times[-1]:g} s; give further points, "
             "fewer horizon.steps, or reference.periodic: true."
+        )
+    if times[-1] < LEAST_STEPS * config.horizon.dt:
+        raise UsageError(
+            f"Expected a reference of {LEAST_STEPS} steps of {config.horizon.dt:g} s or more, got {times[-1]:g} s; "
+            "choose a smaller horizon.dt or reference.speed."
         )
     return times, values
 

@@ -48,7 +48,7 @@ def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")
     x, u = _written_target(config, system), _written_control(config, system)
     if not bool(controls.contains(u)):
-        raise not_admitted_error(u)
+        raise _not_admitted_error(u)
     return TargetCost(cost, x, u)
 
 
@@ -64,8 +64,8 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         point = search.held_by(torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64))
         if not point.held:
             point, note = _move_to_nearest(search, given, point)
-            return Trim(require_admitted(point), [], note)
-        return Trim(require_admitted(point), [], "")
+            return Trim(_require_admitted(point), [], note)
+        return Trim(_require_admitted(point), [], "")
     points = search.find(given)
     if not points:
         raise UsageError(
@@ -75,7 +75,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
     point, *others = points
     if not point.held:
         point, note = _move_to_nearest(search, given, point)
-        return Trim(require_admitted(point), [], note)
+        return Trim(_require_admitted(point), [], note)
     note = f"{_format_entries(given, system)}; solved for {_format_point(point, system, given)}"
     if others:
         further = "; ".join(
@@ -84,7 +84,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         )
         more = f" and {len(others) - LISTED_POINTS} more" if len(others) > LISTED_POINTS else ""
         note += f", the nearest to X₀'s centre of {len(points)}; also {further}{more}"
-    return Trim(require_admitted(point), others, f"target: {note}.")
+    return Trim(_require_admitted(point), others, f"target: {note}.")
 
 
 def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
@@ -178,15 +178,13 @@ def not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> Usage
     )
 
 
-def require_admitted(point: OperatingPoint) -> OperatingPoint:
-    """The point, if its state and control are within their limits; else raises a UsageError."""
+def _require_admitted(point: OperatingPoint) -> OperatingPoint:
     if not point.admitted:
-        raise not_admitted_error(point.u)
+        raise _not_admitted_error(point.u)
     return point
 
 
-def not_admitted_error(u: Tensor) -> UsageError:
-    """The error for a target whose control u* is beyond its limits."""
+def _not_admitted_error(u: Tensor) -> UsageError:
     return UsageError(
         f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
         "choose another target."

@@ -15,7 +15,6 @@ from lyapnet.experiment.assembly.target import (
     log_once,
     named_entries,
     not_held_error,
-    require_admitted,
     state_limits,
     trim,
 )
@@ -158,10 +157,15 @@ class TargetsOfMembers:
         for i, value in self.given(p).items():
             x[i] = value
         found = search.nearest(x, self.solved) if self.solved else search.held_by(x)
+        values = ", ".join(f"{name} = {value:.6g}" for name, value in self.family.values(p.tolist()).items())
         if found is None or not found.held:
-            values = ", ".join(f"{name} = {value:.6g}" for name, value in self.family.values(p.tolist()).items())
             raise not_held_error(search.system, x, f"it is that of {values}: narrow the family, or {CONTROL_ADVICE}")
-        return require_admitted(found)
+        if not found.admitted:
+            raise UsageError(
+                f"Expected controls within limits that hold the target of {values}, got {found.u.tolist()}; widen "
+                "controls, or narrow the family."
+            )
+        return found
 
     def interpolate(self, ranges: Box, tested: Tensor) -> InterpolatedTargets:
         """Polynomials through the operating points of members.

@@ -96,7 +96,8 @@ def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
 def _at_goal(problem: Problem, goal: State | None = None) -> "Backward":
     """The backward pass at x*, without control limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
-    x, u = (problem.goal if goal is None else goal).expand(N + 1, -1), problem.rest.expand(N, -1)
+    center = problem.goal if goal is None else goal
+    x, u = center.expand(N + 1, -1), problem.rest_at(center).expand(N, -1)
     return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False, noise=problem.noise)
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.lab.comparison.planners.planner import LoopLaw, Planner
 from lyapnet.task.problem import Problem
@@ -22,10 +23,13 @@ class Rest(Planner):
     """The control of U nearest to that which costs nothing."""
 
     def __init__(self, problem: Problem):
-        self.u = problem.controls.project(problem.rest).double().cpu().numpy()
+        self.problem = copied(problem)
 
     def law(self) -> LoopLaw:
-        return lambda step, x: self.u
+        def control(step: int, x: NDArray) -> NDArray:
+            return self.problem.controls.project(self.problem.rest_at(torch.from_numpy(x))).numpy()
+
+        return control
 
 
 class Regulator(Planner):
@@ -35,6 +39,8 @@ class Regulator(Planner):
     """
 
     def __init__(self, problem: Problem):
+        if problem.follows_reference:
+            raise UsageError("Expected a goal that stays for lqr, got a reference; leave lqr out.")
         self.goal = problem.goal.double().cpu().numpy()
         self.feedforward, self.gain = (part.numpy() for part in regulator(problem))
 

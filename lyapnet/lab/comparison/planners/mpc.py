@@ -2,6 +2,7 @@
 
 import casadi
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lyapnet.base.contracts import copied
@@ -9,7 +10,7 @@ from lyapnet.base.errors import OracleError, UsageError
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.lab.comparison.planners.planner import LoopLaw, Planner
 from lyapnet.task.problem import Problem
-from lyapnet.value.expansions import riccati
+from lyapnet.value.expansions import Expansion, riccati
 
 SOLVER, ITERATIONS, TOLERANCE = "fatrop", 1000, 1e-6
 LEAST = 5  # steps of a horizon: fatrop does not converge on shorter ones of tasks with many states
@@ -50,6 +51,8 @@ class PredictiveControl(Planner):
             raise UsageError(f"{error} MPC cannot plan without.") from error
         n, m = task.step.size1_in(0), task.step.size1_in(1)
         self._solver, self._tail = _solver(task, steps, self._goal, self._rest), riccati(self.problem)
+        if problem.follows_reference:  # the linearisation about one point of it says nothing of the others
+            self._tail = Expansion(*(torch.zeros_like(part) for part in self._tail))
         free = np.full((steps + 1, n), np.inf)
         lower, upper = (side.expand(m).double().cpu().numpy() for side in self.problem.controls.limits)
         self._bounds = [_stacked(sign * free, np.tile(side, (steps, 1))) for sign, side in ((-1, lower), (1, upper))]

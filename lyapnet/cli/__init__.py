@@ -103,7 +103,7 @@ def _is_closed_output(error: BaseException) -> bool:
 def _explain(error: Any) -> tuple[str, int]:
     """One line and the exit status for an exception that reached the user."""
     if isinstance(error, LyapnetError):
-        more = f" More: docs/troubleshooting.md#{error.section}" if error.section else ""
+        more = f" More: docs/troubleshooting.md#{error.section}." if error.section else ""
         return f"error: {' '.join(str(error).split())}{more}", error.exit_status
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)

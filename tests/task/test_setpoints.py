@@ -76,6 +76,14 @@ def test_the_polynomials_are_of_the_degree_that_each_parameter_needs():
     assert family_cost_of(easy.cost).targets.basis.counts[0] < targets.basis.counts[0]
 
 
+def test_a_parameter_that_matters_only_off_the_middle_counts():
+    """u* = m g l sin θ does not depend on the length at θ = 0."""
+    task = problem(HELD_AT_ANGLES, family={"target_angle": [-0.4, 0.4], "length": [0.9, 1.1]})
+    p = torch.tensor([[0.4, 1.1], [-0.3, 0.95]])
+    z = torch.cat([p[:, :1], torch.zeros(2, 1), p], -1)
+    assert_close(task.system.dynamics(z, task.rest_at(z)), torch.zeros_like(z), atol=1e-6, rtol=0)
+
+
 def test_targets_that_one_control_holds_are_exact():
     task = problem(HELD_AT_ANGLES, system={"name": "double_integrator"}, family={"target_position": [-1, 3]})
     assert isinstance(family_cost_of(task.cost).targets, LinearTargets)

@@ -1,5 +1,6 @@
 """The targets of a family's members: x*(p) and u*(p), with states that are not given solved for."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -27,6 +28,7 @@ from lyapnet.task.sets import Box, ControlSet
 
 TESTED = 8  # random members whose targets are checked, besides those at the ends of the ranges
 COUNTS = (1, 2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter; the first is taken that is accurate
+ASIDE = 0.71  # share of their ranges at which other parameters are meanwhile: in the middle much may vanish
 MOST_MEMBERS = 400  # largest number of members whose targets are interpolated
 CHOOSE_ANOTHER = f"choose another, or {CONTROL_ADVICE}"
 ACCURATE = 1e-8  # largest rate at an interpolated target, in units of the rates on X₀
@@ -174,25 +176,30 @@ class TargetsOfMembers:
             UsageError: they would need too many members.
         """
         counts = [self._count_along(axis, ranges) for axis in range(ranges.dimension)]
-        basis = ChebyshevProducts(ranges.lower, ranges.upper, counts)
-        nodes = basis.nodes()
-        targets = self._through(basis) if len(nodes) <= MOST_MEMBERS else None
-        if targets is None or not self._is_accurate(targets, tested):
-            raise UsageError(
-                f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials "
-                f"through {min(len(nodes), MOST_MEMBERS)} members miss; narrow the family, or write target_control."
-            )
-        return targets
+        for _ in COUNTS:
+            if math.prod(counts) >= MOST_MEMBERS:
+                break
+            targets = self._through(ChebyshevProducts(ranges.lower, ranges.upper, counts))
+            if self._is_accurate(targets, tested):
+                return targets
+            further = [next((more for more in COUNTS if more > count), MOST_MEMBERS) for count in counts]
+            counts = [more if w > 0 else 1 for more, w in zip(further, ranges.widths.tolist(), strict=True)]
+        raise UsageError(
+            f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials through "
+            f"{MOST_MEMBERS} members miss; narrow the family, or write target_control."
+        )
 
     def _count_along(self, axis: int, ranges: Box) -> int:
-        """The number of polynomials that are accurate along a parameter, with the others in the middle."""
+        """The number of polynomials that are accurate along a parameter, with the others off the middle."""
         if ranges.widths[axis] == 0:
             return 1
-        line = Box(*(_with_entry(self.center, axis, float(side[axis])) for side in (ranges.lower, ranges.upper)))
+        aside = ranges.lower + ASIDE * ranges.widths
+        line = Box(*(_with_entry(aside, axis, float(side[axis])) for side in (ranges.lower, ranges.upper)))
         tested = torch.cat([line.corners(), line.sample(TESTED, torch.Generator().manual_seed(0))])
         for count in COUNTS:
             counts = [count if k == axis else 1 for k in range(ranges.dimension)]
-            if self._is_accurate(self._through(ChebyshevProducts(line.lower, line.upper, counts)), tested):
+            targets = self._through(ChebyshevProducts(line.lower, line.upper, counts))
+            if self._is_accurate(targets, tested):
                 return count
         return COUNTS[-1]
 

@@ -16,7 +16,6 @@ from lyapnet.controller.loading import load
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.proof import Progress
 
-SAMPLED = ("sampled", "statistical")  # claims about closed loops, whatever their goal
 NOTHING_KEPT = "Stopped while certifying: the proof of a {} cannot be kept."
 
 
@@ -66,9 +65,9 @@ def certify(
         run.require_used_by(claim)
         if not claim.allows_noise:
             require_no_noise(controller.problem, claim.kind)
-        if controller.problem.follows_reference and claim.kind not in SAMPLED:
+        if controller.problem.follows_reference and not claim.allows_reference:
             raise UsageError(
-                f"Expected a goal that stays for a {claim.kind} certificate, got a reference; {' and '.join(SAMPLED)} "
+                f"Expected a goal that stays for a {claim.kind} certificate, got a reference; sampled and statistical "
                 "certificates take one."
             )
     if len(claims) == 1:

@@ -16,7 +16,6 @@ from lyapnet.task.family import LOGARITHM
 from lyapnet.task.input_disturbances import DisturbedSystem
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
-from lyapnet.task.reference import TIME
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 
 ROUNDING = 1e-6  # by which a setting may exceed its range, relative to it: a problem in float32 has rounded ends
@@ -98,8 +97,10 @@ class OutputFeedback:
 
     def middle_estimate(self) -> State:
         """The centre of X₀, at the beginning of a reference."""
-        system, box = self.problem.system, self.problem.initial_states
-        return torch.where(torch.tensor([name == TIME for name in system.state_names]), box.lower, box.center)
+        time, x = self.problem.system.reference_time, self.problem.initial_states.center.clone()
+        if time is not None:
+            x[time] = self.problem.initial_states.lower[time]
+        return x
 
     def draw_first(self, x0: State, generator: torch.Generator) -> State:
         """A first estimate for each x₀: the centre of X₀, or around x₀ in states that X₀ fixes.

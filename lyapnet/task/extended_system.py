@@ -41,6 +41,14 @@ class ExtendedSystem(ControlAffineSystem):
         """ṡ."""
         return torch.zeros_like(s)
 
+    @property
+    def reference_time(self) -> int | None:
+        return self.system.reference_time
+
+    def recurring(self, x: State) -> State:
+        x, s = self.split(x)
+        return torch.cat([self.system.recurring(x), s], -1)
+
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
         return self.system.draw(x[: self.system.n], u)
 

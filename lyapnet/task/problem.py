@@ -25,7 +25,6 @@ from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.task.noise import Noise, SystemNoise
-from lyapnet.task.reference import TIME
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -125,7 +124,7 @@ class Problem(nn.Module):
     @property
     def follows_reference(self) -> bool:
         """Whether the goal moves with the time on a reference, which is a state."""
-        return TIME in self.system.state_names
+        return self.system.reference_time is not None
 
     @property
     def no_goal(self) -> str:

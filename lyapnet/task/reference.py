@@ -7,8 +7,6 @@ from lyapnet.base.types import State
 from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.systems import ControlAffineSystem
 
-TIME = "reference time"  # name of τ
-
 
 class TimedSystem(ExtendedSystem):
     """ẋ = f(x) + g(x)u and τ̇ = 1, in the state (x, τ).
@@ -19,13 +17,17 @@ class TimedSystem(ExtendedSystem):
     """
 
     def __init__(self, system: ControlAffineSystem, period: float | None):
-        super().__init__(system, [TIME], ["s"])
+        super().__init__(system, ["reference time"], ["s"])
         self.period = period
         self.settings = (*system.settings, system.n)
 
     @property
     def title(self) -> str:
         return f"{self.system.title} along a reference"
+
+    @property
+    def reference_time(self) -> int:
+        return self.system.n
 
     def rates(self, s: Tensor) -> Tensor:
         return torch.ones_like(s)

@@ -48,8 +48,10 @@ def family_of(
     for name in weights:
         if not ranges[name][0] > 0:
             raise UsageError(f"Expected family.{name} > 0, got {ranges[name]}; V is a function of its logarithm.")
-    of_states, moved = _target_indices(ranges, system), _moved_states(ranges, system)
-    units = [system.state_units[of_states[name]] if name in of_states else "" for name in ranges]
+    moved = _moved_states(ranges, system)
+    units = [""] * len(ranges)
+    for i, k in moved.items():
+        units[k] = system.state_units[i]
     family, box = members_of(config, system, ranges, units, initial_states, weights=weights)
     least = [ranges[name][0] for name in weights]
     matrices = weighted_matrices(config.cost, cost, weights, least, own_cost) if weights else None
@@ -148,20 +150,18 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
     return dict(ranges)
 
 
-def _target_indices(names: Collection[str], system: ControlAffineSystem) -> dict[str, int]:
-    """Name target_STATE ↦ index of the state."""
+def _moved_states(names: Collection[str], system: ControlAffineSystem) -> dict[int, int]:
+    """Index of a state ↦ index of the parameter target_STATE that is its target."""
     known = {PREFIX + name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
-    targets = [name for name in names if name.startswith(PREFIX)]
-    for name in targets:
+    moved = dict[int, int]()
+    for k, name in enumerate(names):
+        if not name.startswith(PREFIX):
+            continue
         if name not in known:
             hint = did_you_mean(name, known, "name a state of the system.", "family.")
             raise UsageError(f"Expected family.{name} among {', '.join(known)}, got no such state; {hint}")
-    return {name: known[name] for name in targets}
-
-
-def _moved_states(names: Collection[str], system: ControlAffineSystem) -> dict[int, int]:
-    """Index of a state ↦ index of the parameter that is its target."""
-    return {i: list(names).index(name) for name, i in _target_indices(names, system).items()}
+        moved[known[name]] = k
+    return moved
 
 
 def _check_members(config: Config, family: FamilySystem, box: Box, key: str) -> None:

@@ -49,14 +49,14 @@ def reference_of(
     if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a reference, got one about a goal of its own.")
     times, values = _points_of(config, system)
-    path, control = _fit(times, values, system, initial_states, reference.periodic)
+    path, control, left = _fit(times, values, system, initial_states, reference.periodic)
     if reference.control is not None:
         given = repeated(reference.control, system.m)
         require_length("reference.control", len(given), system.control_names)
         control = _Curve(control.basis, torch.zeros_like(control.coefficients))
         control.coefficients[0] = control.coefficients.new_tensor(given)  # the first function is 1
     else:
-        _require_followed(system, _rates_left(system, path, control, _between(times)))
+        _require_followed(system, left)
         _tell_limits(system, controls, control.at(_between(times)))
     start = torch.zeros(1, dtype=torch.float64)
     x, u = path.at(start), control.at(start)
@@ -147,8 +147,10 @@ def _fit(
     system: ControlAffineSystem,
     initial_states: Box,
     periodic: bool,
-) -> tuple[_Curve, _Curve]:
-    """r and u_r as smooth functions near the given points; states that are not given are rates of others, or 0.
+) -> tuple[_Curve, _Curve, Tensor]:
+    """r and u_r as smooth functions near the given points, and the rates that u_r leaves.
+
+    States that are not given are rates of others, or 0.
 
     Raises:
         UsageError: no such function is near enough.
@@ -162,7 +164,7 @@ def _fit(
     zeros, extent = [i for i in range(system.n) if i not in values and i not in rates], np.ptp(columns, 0)
     if zeros:
         log_once(f"reference: 0 for {', '.join(system.state_names[i] for i in zeros)}, which it does not give.")
-    best: tuple[float, _Curve, _Curve] | None = None
+    best: tuple[_Curve, _Curve, Tensor] | None = None
     for count in COUNTS:
         ends = torch.zeros(1, dtype=torch.float64), torch.tensor([duration], dtype=torch.float64)
         basis = FourierSeries(duration, count) if periodic else ChebyshevProducts(*ends, [count])
@@ -177,17 +179,17 @@ def _fit(
             coefficients[:, i] = slope[:, [*values].index(j)]
         path = _Curve(basis, coefficients)
         control = _Curve(basis, basis.coefficients(_following_control(system, path, basis.nodes())))
-        left = float(_rates_left(system, path, control, _between(times)).max())
-        if best is None or left < best[0] / 2:
-            best = left, path, control
-        if left <= FOLLOWED / 10:
+        left = _rates_left(system, path, control, _between(times))
+        if best is None or bool(left.max() < best[2].max() / 2):
+            best = path, control, left
+        if bool(left.max() <= FOLLOWED / 10):
             break
     if best is None:
         raise UsageError(
             f"Expected a smooth reference, got one with jumps or corners that sums of {COUNTS[-1]} functions miss; "
             "round them, or give more points."
         )
-    return best[1], best[2]
+    return best
 
 
 def _rates_of(system: ControlAffineSystem, initial_states: Box, given: Mapping[int, np.ndarray]) -> dict[int, int]:

@@ -46,6 +46,11 @@ class ControlAffineSystem(nn.Module, ABC):
         """ẋ = f(x) + g(x)u."""
         return self.f(x) + apply(self.g(x), u)
 
+    @property
+    def reference_time(self) -> int | None:
+        """The index of the state that is the time on a reference; None if there is none."""
+        return None
+
     def recurring(self, x: State) -> State:
         """The same state, for a law that begins anew: the time on a periodic reference without whole periods."""
         return x

@@ -44,6 +44,12 @@ class OutputFeedback:
         UsageError: unknown kind.
     """
 
+    law: ContinuedPolicy
+    kind: str
+    outputs: Outputs
+    deviation: Deviations
+    around_state: bool
+    controller: Any
     problem: Problem
     filter: KalmanFilter
     state_of_law: State  # a state that its law takes: its length, precision and device

@@ -20,13 +20,14 @@ extensions = [
     "plain_docstrings",
     "printed_outputs",
     "native_math",
+    "notebook_pages",
 ]
 exclude_patterns = ["_extensions", "compare/details.md", "compare/table1.md"]  # the report's tables are downloads
 
 myst_heading_anchors = 3  # the anchors of Git hosts, which the pages link to
 myst_enable_extensions = ["fieldlist", "dollarmath"]
 myst_fence_as_directive = ["math"]  # as on Git hosts
-nb_execution_mode = "off"  # the pages say what was printed; -D nb_execution_mode=force trains
+nb_execution_mode = "off"  # for a quick look; the published site has -D nb_execution_mode=force
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True

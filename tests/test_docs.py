@@ -19,7 +19,7 @@ from lyapnet.experiment.recipe import STANDARD
 from lyapnet.lab.comparison.plan import ComparisonConfig
 from lyapnet.loop.programs import PROGRAMS
 from lyapnet.value.networks import NETWORKS
-from tests.pages import PAGES, README, REPORT, ROOT
+from tests.pages import NOTEBOOKS, PAGES, README, REPORT, ROOT, prose_of
 
 WIDTH = 120
 FENCED = re.compile(r"^```.*?^```$", flags=re.DOTALL | re.MULTILINE)
@@ -49,17 +49,17 @@ def without_code(text: str) -> str:
 
 def targets(page: Path) -> list[str]:
     """Where the links and pictures of a page lead, other sites aside."""
-    found = re.findall(r"\]\(([^)\s]+)\)", without_code(page.read_text(encoding="utf-8")))
+    found = re.findall(r"\]\(([^)\s]+)\)", without_code(prose_of(page)))
     return [target for target in found if not target.startswith(("https://", "http://"))]
 
 
 def anchors(page: Path) -> set[str]:
     """The sections of a page as Git hosts name them in addresses."""
-    headings = re.findall(r"^#+ (.*)$", FENCED.sub("", page.read_text(encoding="utf-8")), flags=re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", FENCED.sub("", prose_of(page)), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", [*PAGES, REPORT], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", [*PAGES, REPORT, *NOTEBOOKS], ids=lambda path: path.name)
 def test_links_resolve(page):
     for target in targets(page):
         place, _, anchor = target.partition("#")
@@ -81,8 +81,8 @@ def test_every_page_is_reached_from_the_readme():
         if page not in reached:
             reached.add(page)
             linked = [(page.parent / target.partition("#")[0]).resolve() for target in targets(page)]
-            waiting += [path for path in linked if path.suffix == ".md"]
-    assert reached >= set(ROOT.glob("docs/**/*.md"))
+            waiting += [path for path in linked if path.suffix in (".md", ".ipynb")]
+    assert reached >= {*ROOT.glob("docs/**/*.md"), *NOTEBOOKS}
 
 
 def pictures(page: Path) -> list[Path]:

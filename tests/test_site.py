@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.links import broken_links
-from tests.pages import ROOT
+from tests.pages import NOTEBOOKS, ROOT
 
 DOCS = ROOT / "docs"
 LEADERBOARD = DOCS / "leaderboard.md"
@@ -57,7 +57,7 @@ def on_the_sidebar() -> set[str]:
 
 def test_every_page_is_on_the_sidebar():
     tables = {"compare/table1", "compare/details"}  # of the report, to download
-    pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.glob("**/*.md")}
+    pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in (*DOCS.glob("**/*.md"), *NOTEBOOKS)}
     assert on_the_sidebar() == pages - {"index"} - tables
 
 

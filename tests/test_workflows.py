@@ -54,6 +54,7 @@ def test_the_site_is_built_as_the_pages_say():
     (built,) = [c for c in commands(WORKFLOWS["site"]["jobs"]["publish"]) if c.startswith("sphinx-build")]
     assert built.startswith("sphinx-build -q -W ")
     assert built.endswith(" docs build/site")
+    assert " -D nb_execution_mode=force " in built, "the notebooks show what they printed"
 
 
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda path: path.stem)

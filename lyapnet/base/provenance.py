@@ -8,6 +8,7 @@ from pathlib import Path
 from lyapnet import __version__
 
 RUN_RECORD = "run.json"  # record of a run; its presence marks a run's folder
+EVALUATION = "evaluation.json"  # written last: a run with this file is finished
 
 
 def versions(*packages: str) -> dict[str, str]:

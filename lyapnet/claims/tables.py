@@ -32,7 +32,8 @@ def table_of(title: str, rows: Iterable[tuple[str, str]]) -> Table:
 
 def text_of(table: Table) -> str:
     """A table as text."""
-    console = Console(file=io.StringIO(), width=100, highlight=False, markup=False)
+    plain = {"highlight": False, "markup": False, "force_jupyter": False, "color_system": None}  # in a notebook too
+    console = Console(file=io.StringIO(), width=100, **plain)
     with console.capture() as printed:
         console.print(table)
     return printed.get().rstrip()

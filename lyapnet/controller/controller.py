@@ -15,6 +15,8 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
+from lyapnet.controller.html import controller_as_html
+from lyapnet.controller.origin import Origin
 from lyapnet.controller.output_feedback import OutputFeedback, in_form_of
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member, named, ranges_of
 from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
@@ -83,6 +85,7 @@ class Controller:
     problem: Problem
     program: Program
     V: ValueFunction
+    origin: Origin | None
     _after_horizon: AfterHorizon | None
 
     def __init__(
@@ -96,6 +99,7 @@ class Controller:
         parts: Parts | None = None,
         policy: type[ValuePolicy] | None = None,
         after_horizon: AfterHorizon | None = None,
+        origin: Origin | None = None,
     ):
         """A controller from its parts.
 
@@ -114,6 +118,7 @@ class Controller:
             policy: the control law of V, if there is no rollout; None: the law that V is made for, or the HJB law if
                 that is unknown, with a note if it matters.
             after_horizon: the result of an earlier choice of the law after T.
+            origin: the checkpoint that V was loaded from; None: there is none.
 
         Raises:
             UsageError: V.made_for is no control law.
@@ -122,7 +127,7 @@ class Controller:
         self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
         self.program = ValueProgram() if program is None else program
         self._warned = False  # whether a warning of parameters outside the family was logged
-        self.V = V.requires_grad_(False).eval()
+        self.V, self.origin = V.requires_grad_(False).eval(), origin
         if rollout is not None and policy is not None:
             raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
         gradient = "backprop" if problem.noise is None else "discrete"  # the only one that knows noise
@@ -138,6 +143,10 @@ class Controller:
         horizon, V, law = self.horizon, type(self.V).__name__, type(self.closed_loop.policy).__name__
         about = f"{type(self.system).__name__}, {V}, {law}, {horizon.steps} steps of {horizon.dt:g} s"
         return f"{type(self).__name__}({about})"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a table, and some closed loops."""
+        return controller_as_html(self)
 
     @property
     def config(self) -> Config:
@@ -322,7 +331,8 @@ class Controller:
         Raises:
             ValueError: unknown name; or riccati, and the goal is no equilibrium that a linear law can stabilise.
         """
-        return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, self._parts)
+        parts, origin = self._parts, self.origin
+        return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, parts, origin=origin)
 
     @overload
     def rollout(

@@ -11,6 +11,7 @@ from torch import nn
 from lyapnet.base.devices import require_device
 from lyapnet.base.errors import CheckpointError, UsageError
 from lyapnet.controller.controller import Controller
+from lyapnet.controller.origin import Origin
 from lyapnet.experiment.assembly import (
     REGISTRIES,
     Parts,
@@ -91,7 +92,8 @@ def _controller_of(
     if beyond is None and after_horizon is not None and not after_horizon.holds:
         logging.getLogger(__name__).warning("note: %s; %s.", after_horizon, REMEDY)
     rollout = build_rollout(config, problem, V)
-    return Controller(problem, V, rollout, own, config, beyond, parts, after_horizon=after_horizon)
+    origin = Origin.of(path, content)
+    return Controller(problem, V, rollout, own, config, beyond, parts, after_horizon=after_horizon, origin=origin)
 
 
 def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Control, State
+from lyapnet.controller.html import loop_as_html
 from lyapnet.loop.estimation.kalman import FILTERS, Belief, Deviations, KalmanFilter
 from lyapnet.task.family import LOGARITHM
 from lyapnet.task.input_disturbances import DisturbedSystem
@@ -71,6 +72,10 @@ class OutputFeedback:
         self.settings = {names[i].removeprefix(LOGARITHM): i for i in problem.system.settings}
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a table."""
+        return loop_as_html(self)
 
     def reset(self, x_hat: Any = None, P: Any = None, t: float = 0.0) -> None:
         """Begin again: the next call of `step` is at t.

@@ -58,7 +58,7 @@ def train(
         overrides: changes to the config, as key.sub=value.
         resume: "last", or the path of a checkpoint: continue that run. A finished run is left as it is.
         finetune: a checkpoint with the initial weights of a new run.
-        console: shows the progress; None: the terminal.
+        console: shows the progress; None: the terminal, or in a notebook the output of the cell, as plain text.
         parts: the user's objects, used instead of those that the config names; these are then not imported.
 
     Raises:
@@ -74,8 +74,16 @@ def train(
     with default_of(resolved):
         plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
         if not plan.finished:
-            fit(plan, console or Console(highlight=False, markup=False), again)
+            fit(plan, console or _default_console(), again)
     return plan.run
+
+
+def _default_console() -> Console:
+    """The terminal; in a notebook one without HTML, whose lines stay together in one output."""
+    console = Console(highlight=False, markup=False)
+    if not console.is_jupyter:
+        return console
+    return Console(highlight=False, markup=False, force_jupyter=False, force_terminal=False, color_system=None)
 
 
 def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:

@@ -10,13 +10,12 @@ from typing import Any
 
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.files import read_json, write_json
-from lyapnet.base.provenance import RUN_RECORD, commit, versions
+from lyapnet.base.provenance import EVALUATION, RUN_RECORD, commit, versions
 from lyapnet.experiment.config import Config, configs_of_seeds, label_of
 from lyapnet.training.run_lock import RunLock
 
 LAST, BEST = "last", "best"
 CONFIG = "config.yaml"
-EVALUATION = "evaluation.json"  # written last: a run with this file is finished
 RECORDED = {  # keys of run.json ↦ types, and the default for version 0.1, which lacks some keys (...: required)
     "finetuned_from": (str | None, ...), "compiled": (bool, False), "saved": (bool | None, None),
     "training_seconds": (float | int, 0.0), "peak_bytes": (int, 0), "returns": (list, []),

@@ -1,0 +1,46 @@
+"""The file that a controller was loaded from, and what is on record about it."""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lyapnet.base.errors import LyapnetError
+from lyapnet.base.files import read_json
+from lyapnet.base.provenance import EVALUATION
+from lyapnet.experiment.checkpoint import KEY, ZOO, located
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A checkpoint: how it was named, after how many steps of training it was written, and by which version."""
+
+    path: str
+    steps: int | None
+    version: str | None
+
+    @classmethod
+    def of(cls, path: str | Path, content: dict[str, Any]) -> "Origin":
+        """The origin of a controller from the content of its checkpoint."""
+        return cls(str(path), content.get("global_step"), content[KEY].get("version"))
+
+    def evaluation(self) -> dict[str, Any]:
+        """The evaluation that its training ended with, or that of the zoo; empty where none is on record."""
+        file = located(self.path)
+        with suppress(LyapnetError):
+            if file.parent == ZOO:
+                return _mapping(_mapping(read_json(file.with_suffix(".json"), "")).get("evaluation"))
+            if file.name == "best.ckpt":  # the one that is evaluated at the end
+                return _mapping(read_json(file.parents[1] / EVALUATION, ""))
+        return {}
+
+
+def number_in(record: dict[str, Any], key: str) -> float | None:
+    """A finite number of a record; None where there is none."""
+    found = record.get(key)
+    return float(found) if isinstance(found, int | float) and math.isfinite(found) else None
+
+
+def _mapping(content: Any) -> dict[str, Any]:
+    return content if isinstance(content, dict) else {}

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -55,6 +56,23 @@ def site_with(notebook: Path, folder: Path) -> subprocess.CompletedProcess:
     options = ["-D", "nb_execution_mode=force", "-D", "suppress_warnings=myst.xref_missing"]
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "-c", str(ROOT / "docs"), *options, str(pages)]
     return subprocess.run([*command, str(folder / "site")], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_page_offers_the_file_and_says_whether_it_was_run(notebook, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs" / "_extensions")
+    from notebook_pages import NOT_RUN, with_download  # pyright: ignore[reportMissingImports]
+
+    for mode in ("off", "force"):
+        source = [notebook.read_text(encoding="utf-8")]
+        app = SimpleNamespace(config=SimpleNamespace(nb_execution_mode=mode))
+        with_download(app, f"notebooks/{notebook.stem}", source)
+        first = "".join(json.loads(source[0])["cells"][0]["source"])
+        assert f"`{notebook.name}`" in first
+        assert (NOT_RUN in first) == (mode == "off")
+    other = ["# A page\n"]
+    with_download(app, "notation", other)
+    assert other == ["# A page\n"]
 
 
 @pytest.mark.gate

@@ -9,19 +9,16 @@ import shlex
 import time
 from collections.abc import Sequence
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from lyapnet.base.errors import one_line
 from lyapnet.controller.origin import number_in
 from lyapnet.experiment.assembly import own_parts
 from lyapnet.task.constraints import names_of
 from lyapnet.task.systems import moving_states
-
-if TYPE_CHECKING:
-    from lyapnet.controller.controller import Controller
-    from lyapnet.controller.output_feedback import OutputFeedback
 
 SECONDS = 1.0  # closed loops that take longer than this are not drawn
 MOST_LINES = 8  # states, and controls, that the table lists
@@ -32,17 +29,19 @@ MOST_POINTS = 80  # of a curve
 STATES, CONTROLS, VALUE = "steelblue", "seagreen", "peru"  # legible on white and on black
 
 
-def controller_as_html(controller: "Controller") -> str:
-    """The table and the drawing of a controller."""
-    try:
-        drawing = _drawing(controller)
-    except Exception as error:  # whatever the parts of users do: the table is shown nevertheless
-        drawing = _note(f"No closed loops are drawn: {type(error).__name__}: {error}")
-    return f"{_table(type(controller).__name__, _rows(controller))}{drawing}"
+def controller_as_html(controller: Any) -> str:
+    """The table and the drawing of a Controller; where the parts of users fail, a sentence in its place."""
+    html = []
+    for what, part in (("table", _table_of), ("drawing of closed loops", _drawing)):
+        try:
+            html.append(part(controller))
+        except Exception as error:  # whatever users' code raises: what a notebook shows is no place to fail
+            html.append(_note(f"There is no {what}: {type(error).__name__}: {one_line(error)}"))
+    return "".join(html)
 
 
-def loop_as_html(loop: "OutputFeedback") -> str:
-    """The table of a controller with an estimator."""
+def loop_as_html(loop: Any) -> str:
+    """The table of an OutputFeedback."""
     outputs = loop.outputs
     readings = zip(outputs.names, outputs.units, outputs.noise.tolist(), strict=True)
     rows = [
@@ -54,8 +53,8 @@ def loop_as_html(loop: "OutputFeedback") -> str:
     return _table(type(loop).__name__, rows)
 
 
-def _rows(controller: "Controller") -> list[tuple[str, list[str]]]:
-    """(label, lines of text) of each row of the table."""
+def _table_of(controller: Any) -> str:
+    """What a controller is: system, X₀, controls, horizon, V, and its training."""
     problem, system, horizon = controller.problem, controller.system, controller.horizon
     box, goal = controller.initial_states, controller.cost.goal
     ends = zip(system.state_labels, box.lower.tolist(), box.upper.tolist(), strict=True)
@@ -65,7 +64,8 @@ def _rows(controller: "Controller") -> list[tuple[str, list[str]]]:
         ("X₀", _first([f"{label} {_interval(low, high)}" for label, low, high in ends])),
     ]
     if goal is not None and not system.constants:
-        rows.append(("goal", _first([f"{n} = {_number(x)}" for n, x in zip(system.state_labels, goal, strict=True)])))
+        entries = zip(system.state_labels, goal.tolist(), strict=True)
+        rows.append(("goal", _first([f"{label} = {_number(entry)}" for label, entry in entries])))
     rows += [
         ("controls", _controls(controller)),
         ("horizon", [f"{horizon.steps} steps of {_number(horizon.dt)} s ({controller.method})" + (
@@ -76,10 +76,10 @@ def _rows(controller: "Controller") -> list[tuple[str, list[str]]]:
         rows.append(("constraints", _first([str(name) for name in named])))
     if problem.noise is not None:
         rows.append(("noise", [f"{problem.noise.sources} of it; the closed loops below are without"]))
-    return rows + _history(controller)
+    return _table(type(controller).__name__, rows + _history(controller))
 
 
-def _controls(controller: "Controller") -> list[str]:
+def _controls(controller: Any) -> list[str]:
     """A line for each control with its limits."""
     system, controls = controller.system, controller.controls
     if controls.limits is None:
@@ -89,7 +89,7 @@ def _controls(controller: "Controller") -> list[str]:
     return _first([f"{n} {_interval(*ends)}" for n, *ends in zip(system.control_labels, lower, upper, strict=True)])
 
 
-def _history(controller: "Controller") -> list[tuple[str, list[str]]]:
+def _history(controller: Any) -> list[tuple[str, list[str]]]:
     """Rows on training, measured numbers and the page, of a controller from a file."""
     origin = controller.origin
     if origin is None:
@@ -139,7 +139,7 @@ def _interval(low: float, high: float) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{float(value):.3g}".replace("-", "−")
+    return f"{value:.3g}".replace("-", "−")
 
 
 class _Panel(NamedTuple):
@@ -151,16 +151,18 @@ class _Panel(NamedTuple):
     limits: Sequence[float] = ()
 
 
-def _drawing(controller: "Controller") -> str:
+def _drawing(controller: Any) -> str:
     """States, controls and V of some closed loops over time, or a sentence on why there are none."""
     box, system, horizon = controller.initial_states, controller.system, controller.horizon
-    x0 = torch.cat([box.center[None], box.corners(2).to(box.lower)])
-    controller.closed_loop.policy(box.lower.new_zeros(()), x0)  # the first call of a law is slower
+    x0 = torch.cat([box.center[None], box.corners(2)])
+    controller.policy(0.0, x0)  # the first call of a law is slower
     begun = time.perf_counter()
-    controller.closed_loop.policy(box.lower.new_zeros(()), x0)
+    controller.policy(0.0, x0)
     expected = horizon.steps * (time.perf_counter() - begun)
     if expected > SECONDS:
-        return _note(f"No closed loops are drawn: they take about {expected:.0f} s; ask controller.rollout(x0).")
+        return _note(
+            f"There is no drawing of closed loops: they take about {expected:.0f} s; ask controller.rollout(x0)."
+        )
     trajectory = controller.rollout(x0)
     x, u, V = (part.numpy(force=True) for part in (trajectory.x, trajectory.u, trajectory.require_value()))
     lower, upper = controller.controls.limits or (torch.tensor(-np.inf), torch.tensor(np.inf))
@@ -194,8 +196,8 @@ def _svg(panel: _Panel, duration: float) -> str:
     right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
     across = LEFT + (right - LEFT) * places / max(places[-1], 1)
 
-    def height(value: np.ndarray | float) -> np.ndarray:
-        return bottom - (bottom - TOP - 4) * (np.asarray(value) - low) / (high - low or 1.0) - 2
+    def height(value: Any) -> Any:
+        return bottom - (bottom - TOP - 4) * (value - low) / (high - low or 1.0) - 2
 
     parts = [
         f'<path d="M{LEFT} {TOP}V{bottom}H{right}" fill="none" stroke="currentColor" stroke-opacity="0.5"/>',

@@ -78,7 +78,7 @@ class Box(nn.Module):
         free = torch.nonzero(self.widths > 0).flatten()[:axes]
         found = self.center.repeat(2 ** len(free), 1)
         for k, i in enumerate(free):
-            upper = torch.arange(len(found)).bitwise_right_shift(k) % 2 == 1
+            upper = torch.arange(len(found), device=found.device).bitwise_right_shift(k) % 2 == 1
             found[:, i] = torch.where(upper, self.upper[i], self.lower[i])
         return found
 

@@ -9,6 +9,7 @@ import torch
 
 import lyapnet
 from lyapnet.base.files import write_json
+from lyapnet.exchange.importing import controller_of as imported
 from lyapnet.experiment.checkpoint import ZOO, zoo_names
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.systems import DoubleIntegrator
@@ -90,7 +91,7 @@ class Hostile(DoubleIntegrator):
         self.control_names = ("<b>u</b>",)
 
 
-def test_text_of_users_is_escaped(tmp_path):
+def test_text_of_users_is_escaped(tmp_path, monkeypatch):
     limits = StateLimits([0], [2.0], [1.0], [1.0], ["<i>position</i>"])
     problem = problem_of(Hostile())
     problem.constraints = limits
@@ -105,6 +106,10 @@ def test_text_of_users_is_escaped(tmp_path):
         assert "<script>alert(1)</script>" in page.text
         assert drawn(page)
     assert "from 12 states" in shown[1].text
+    hostile = lyapnet.load(folder / "best.ckpt", system=Hostile())
+    assert "<script>" not in hostile._repr_html_()
+    monkeypatch.setattr("lyapnet.controller.html.escape", str)
+    assert "<script>" in hostile._repr_html_()
 
 
 def test_numbers_are_those_on_record_beside_the_best_checkpoint(tmp_path):
@@ -130,8 +135,9 @@ def test_controllers_without_a_file():
     assert drawn(page) == 4 * 5  # two states, a control and V, from the centre and four corners
 
 
-# a reference, weights as parameters, noise, outputs, constraints, many states
-ODD = ["reacher_circle", "pendulum_weights", "pendulum_noise", "cartpole_outputs", "keep_out", "integrator_chain"]
+# no end, a reference, weights as parameters, noise, outputs, constraints, many states
+ODD = ["regions/double_integrator", "reacher_circle", "pendulum_weights", "pendulum_noise", "cartpole_outputs"]
+ODD += ["keep_out", "integrator_chain"]
 
 
 @pytest.mark.parametrize("name", sample(ODD, 3))
@@ -153,6 +159,16 @@ def test_a_member_another_law_after_the_horizon_float32_and_an_estimator_are_sho
     single = untrained("double_integrator", "training.precision=float32")
     single = lyapnet.Controller(single.problem.to(torch.float32), single.V.to(torch.float32), policy=lyapnet.HJBPolicy)
     assert drawn(page_of(single))
+
+
+def test_a_law_of_others_is_shown():
+    value, law = (
+        torch.nn.Sequential(torch.nn.Linear(2, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)),
+        torch.nn.Linear(2, 1),
+    )
+    page = page_of(imported(problem_of(DoubleIntegrator()), value, law))
+    assert "GivenValue, GivenLaw" in page.text
+    assert drawn(page)
 
 
 class Raising(DoubleIntegrator):

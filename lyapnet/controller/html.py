@@ -17,6 +17,7 @@ import torch
 from lyapnet.base.errors import one_line
 from lyapnet.controller.origin import number_in
 from lyapnet.experiment.assembly import own_parts
+from lyapnet.loop.programs import LyapunovProgram
 from lyapnet.task.constraints import names_of
 from lyapnet.task.systems import moving_states
 
@@ -94,9 +95,9 @@ def _history(controller: Any) -> list[tuple[str, list[str]]]:
     origin = controller.origin
     if origin is None:
         return []
-    config, program = controller.config, type(controller.program).__name__
+    config, program = controller.config, controller.program
     steps = "" if origin.steps is None else f"{origin.steps} steps, "
-    trained = f"{steps}{program}, seed {config.seed}, lyapnet {origin.version or 'unknown'}"
+    trained = f"{steps}{type(program).__name__}, seed {config.seed}, lyapnet {origin.version or 'unknown'}"
     rows = [("trained", [trained, origin.path])]
     record = origin.evaluation()
     measured = [
@@ -107,11 +108,15 @@ def _history(controller: Any) -> list[tuple[str, list[str]]]:
             ("samples", "from {:.0f} states of X₀"),
         )
         if (number := number_in(record, key)) is not None
+        and (key != "satisfied_fraction" or isinstance(program, LyapunovProgram))  # no other asks for it
     ]  # fmt: skip
     if measured:
         rows.append(("measured", [", ".join(measured)]))
-    own = [word for part, name in own_parts(config).items() for word in (f"--{part}", name)]
-    command = shlex.join(["lyapnet", "view", origin.path, *own, "--out", "page.html"])
+    own = own_parts(config)
+    if any(name.startswith("__main__:") for name in own.values()):  # of a notebook, which no command imports
+        return rows
+    parts = [word for part, name in own.items() for word in (f"--{part}", name)]
+    command = shlex.join(["lyapnet", "view", origin.path, *parts, "--out", "page.html"])
     return [*rows, ("page", [command])]
 
 

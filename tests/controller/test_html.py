@@ -121,8 +121,21 @@ def test_numbers_are_those_on_record_beside_the_best_checkpoint(tmp_path):
     write_json(tmp_path / "evaluation.json", {"cost_ratio": 1.25, "value_error": None, "samples": 7})
     assert "cost / optimum 1.2500, from 7 states" in page_of(lyapnet.load(folder / "best.ckpt")).text
     assert "measured" not in page_of(lyapnet.load(folder / "last.ckpt")).text
+    write_json(tmp_path / "evaluation.json", {"satisfied_fraction": 0.5})
+    controller = lyapnet.load(folder / "best.ckpt")
+    assert "Lyapunov condition on 50.0%" in page_of(controller).text
+    controller.program = lyapnet.ValueProgram()
+    assert "Lyapunov condition" not in page_of(controller).text
     (tmp_path / "evaluation.json").write_text("[1, 2")
     assert "measured" not in page_of(lyapnet.load(folder / "best.ckpt")).text
+
+
+def test_the_command_for_a_page_names_own_classes_that_it_can_import(monkeypatch):
+    controller = lyapnet.load("zoo:double_integrator")
+    for name, there in (("my_module:Cart", True), ("__main__:Cart", False)):
+        controller.config.system.name = name
+        assert (f"--system {name} --out page.html" in page_of(controller).text) == there
+        assert ("lyapnet view" in page_of(controller).text) == there
 
 
 def controller_of(problem, **options):

@@ -31,6 +31,7 @@ nb_execution_mode = "off"  # for a quick look; the published site has -D nb_exec
 nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
+nb_execution_show_tb = True
 nb_merge_streams = True
 
 autosummary_generate = False  # one page holds them all

@@ -30,8 +30,7 @@ myst_fence_as_directive = ["math"]  # as on Git hosts
 nb_execution_mode = "off"  # for a quick look; the published site has -D nb_execution_mode=force
 nb_execution_in_temp = True
 nb_execution_timeout = 600
-nb_execution_raise_on_error = True
-nb_execution_show_tb = True
+nb_execution_show_tb = True  # of a cell that fails, in the warning that -W makes an error
 nb_merge_streams = True
 
 autosummary_generate = False  # one page holds them all

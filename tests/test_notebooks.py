@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from lyapnet.claims.tables import table_of, text_of
 from tests.pages import NOTEBOOKS, ROOT, cells_of
 from tests.test_docs import FENCED, WIDTH
 
@@ -45,6 +46,14 @@ def test_axes_have_labels_with_units(notebook):
     labels = re.findall(r'[xy]label="([^"]+)"', code)
     assert len(re.findall(r"plt\.subplots", code)) <= len(labels)
     assert not [label for label in labels if not re.search(r"\(.+\)|cost", label)]
+
+
+def test_a_table_has_no_control_characters_in_a_notebook(monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a notebook's kernel has it
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    text = text_of(table_of("title", [("label", "1")]))
+    assert "title" in text
+    assert "\x1b" not in text
 
 
 def site_with(notebook: Path, folder: Path) -> subprocess.CompletedProcess:
@@ -84,6 +93,7 @@ def test_a_notebook_runs_and_the_site_shows_what_it_printed(notebook, tmp_path):
     page = (tmp_path / "site" / "notebooks" / f"{notebook.stem}.html").read_text(encoding="utf-8")
     pictures, sentences = EXPECTED[notebook.stem]
     assert len(list((tmp_path / "site" / "_images").glob("*.png"))) + page.count("<title>Closed loops") >= pictures
+    assert "white-space:pre" not in page, "progress is plain text, in one output"
     text = re.sub(r"<[^>]+>", "", page)
     assert not [sentence for sentence in sentences if not re.search(sentence, text)]
     assert f"{notebook.name}</span>, without outputs" in re.sub(r"</?code[^>]*>|</?a[^>]*>", "", page)

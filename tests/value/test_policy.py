@@ -151,6 +151,8 @@ def test_control_and_its_gradients_are_finite_at_the_goal(policy, system, cost, 
 
 
 def test_the_formula_as_printed_is_not_finite_at_the_goal(system, cost):
+    if bool(system.f(torch.zeros(system.n)).any()):
+        return  # the goal is no equilibrium, and the formula does not vanish there
     with pytest.raises(AssertionError):
         is_finite_at_the_goal(UnguardedSontag(problem_of(system, cost), anchored(system)), system)
 

@@ -9,6 +9,7 @@ from lyapnet.task.systems.pendulum import Pendulum
 from lyapnet.task.systems.planar_quadrotor import PlanarQuadrotor
 from lyapnet.task.systems.reacher import Reacher
 from lyapnet.task.systems.rigid_body import BodyFrameQuadrotor, Quadrotor, Satellite
+from lyapnet.task.systems.rocket import Rocket
 from lyapnet.task.systems.three_link_arm import ThreeLinkArm
 from lyapnet.task.systems.van_der_pol import VanDerPol
 
@@ -25,6 +26,7 @@ SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "quadrotor": Quadrotor,
     "body_frame_quadrotor": BodyFrameQuadrotor,
     "satellite": Satellite,
+    "rocket": Rocket,
     "van_der_pol": VanDerPol,
     "path_tracking": PathTracking,
 }
@@ -44,6 +46,7 @@ __all__ = [
     "PlanarQuadrotor",
     "Quadrotor",
     "Reacher",
+    "Rocket",
     "Satellite",
     "ThreeLinkArm",
     "VanDerPol",

@@ -21,6 +21,7 @@ from lyapnet.task.systems import (
     PathTracking,
     Quadrotor,
     Reacher,
+    Rocket,
     Satellite,
     ThreeLinkArm,
 )
@@ -69,8 +70,10 @@ def is_differentiable(system):
 
 
 def rests_at_the_origin(system):
-    """Without control; on a circle, with the steering that goes round it."""
+    """Without control; on a circle, with the steering that goes round it; a rocket hovers."""
     u = torch.tensor([0.1]) if isinstance(system, PathTracking) else torch.zeros(system.m)
+    if isinstance(system, Rocket):
+        u[-1] = system.gravity
     assert_close(system.dynamics(torch.zeros(system.n), u), torch.zeros(system.n))
 
 

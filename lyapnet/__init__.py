@@ -30,8 +30,20 @@ if TYPE_CHECKING:
     from lyapnet.loop.programs import LyapunovProgram, Program, Tolerances, ValueProgram
     from lyapnet.loop.rollout import Rollout, Trajectory
     from lyapnet.prover.branch_and_bound import Budget
+    from lyapnet.task.ball import ControlBall
     from lyapnet.task.constraints import AllOf, Ball, Constraints, StateLimits
     from lyapnet.task.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
+    from lyapnet.task.cost.control_costs import (
+        AbsoluteCost,
+        ControlCost,
+        ControlCosts,
+        EntropyCost,
+        LogCosCost,
+        NormCost,
+        PowerCost,
+        PseudoHuberControlCost,
+        SeparableCost,
+    )
     from lyapnet.task.horizon import Horizon
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
@@ -56,6 +68,17 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "exchange.export": ["export"],
     "controller.controller": ["ArrayTrajectory", "Controller"],
     "task.cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
+    "task.cost.control_costs": [
+        "AbsoluteCost",
+        "ControlCost",
+        "ControlCosts",
+        "EntropyCost",
+        "LogCosCost",
+        "NormCost",
+        "PowerCost",
+        "PseudoHuberControlCost",
+        "SeparableCost",
+    ],
     "base.errors": ["LyapnetError"],
     "base.interpolation": ["Table"],
     "base.linear_algebra": ["norm"],
@@ -66,6 +89,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "task.problem": ["Problem"],
     "loop.programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
     "loop.rollout": ["Rollout", "Trajectory"],
+    "task.ball": ["ControlBall"],
     "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
     "task.systems": ["SYSTEMS", "ControlAffineSystem"],
     "training.data": ["InitialStateDataModule"],
@@ -76,6 +100,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
 
 __all__ = [
     "SYSTEMS",
+    "AbsoluteCost",
     "AllOf",
     "ArrayTrajectory",
     "Ball",
@@ -85,26 +110,34 @@ __all__ = [
     "Claim",
     "Constraints",
     "ControlAffineSystem",
+    "ControlBall",
     "ControlBox",
+    "ControlCost",
+    "ControlCosts",
     "ControlSet",
     "Controller",
     "Cost",
+    "EntropyCost",
     "Everywhere",
     "Funnel",
     "HJBPolicy",
     "Horizon",
     "InitialStateDataModule",
+    "LogCosCost",
     "LookaheadPolicy",
     "LowerBound",
     "LyapnetError",
     "LyapunovProgram",
     "NoisyFunnel",
+    "NormCost",
     "ObstacleCost",
     "OptimizerOptions",
     "OutputFeedback",
     "PeriodicCost",
+    "PowerCost",
     "Problem",
     "Program",
+    "PseudoHuberControlCost",
     "PseudoHuberCost",
     "QuadraticCost",
     "Reach",
@@ -113,6 +146,7 @@ __all__ = [
     "Run",
     "Sampled",
     "SampledPolicy",
+    "SeparableCost",
     "SontagPolicy",
     "StateLimits",
     "Statistical",

@@ -103,6 +103,11 @@ class RiseCondition(DecreaseCondition):
                 f"Expected ℓ = q + (u − u*)ᵀR(u − u*), got {type(cost).__name__} with its own `running` or `control`; "
                 "leave these methods as they are, and put terms in x into `state`."
             )
+        if cost.nonquadratic is not None or not problem.controls.is_box:
+            raise UsageError(
+                "Expected controls that cost uᵀRu, without limits or between them, for a bound from below, got another "
+                "cost or set; measure the cost beside the optimum instead."
+            )
         if limits is None or (problem.controls.limited and not all(bool(side.isfinite().all()) for side in limits)):
             raise UsageError(
                 "Expected controls without limits, or with two finite limits each, for a bound from below, got "

@@ -211,7 +211,7 @@ def _name(system: ControlAffineSystem) -> str:
 def _controls(controller: Controller, config: Config) -> dict[str, Any]:
     """The limits of U with None for ∞; the class and parameters of another set; empty if U = ℝᵐ."""
     controls = controller.controls
-    if controls.limits is None:
+    if controls.limits is None or not controls.is_box:
         return {"name": f"{type(controls).__module__}:{type(controls).__qualname__}", **config.controls.parameters}
     if not controls.limited:
         return {}

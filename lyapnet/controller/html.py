@@ -83,8 +83,8 @@ def _table_of(controller: Any) -> str:
 def _controls(controller: Any) -> list[str]:
     """A line for each control with its limits."""
     system, controls = controller.system, controller.controls
-    if controls.limits is None:
-        inside = f" in {type(controls).__name__}" if controls.limited else " without limits"
+    if controls.limits is None or not controls.is_box:
+        inside = f" in {controls}" if controls.limited else " without limits"
         return _first([label + inside for label in system.control_labels])
     lower, upper = (limit.expand(system.m).tolist() for limit in controls.limits)
     return _first([f"{n} {_interval(*ends)}" for n, *ends in zip(system.control_labels, lower, upper, strict=True)])

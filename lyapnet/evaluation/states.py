@@ -168,6 +168,8 @@ def _worst(problem: Problem, trajectory: Trajectory) -> tuple[Tensor | None, Ten
 def _at_limits(controls: ControlSet, u: ControlPath) -> Tensor | None:
     if controls.limits is None or not controls.limited:
         return None
+    if not controls.is_box:
+        return None
     return torch.stack([(u == limit.to(u)).to(u).mean(0) for limit in controls.limits], 1)
 
 

@@ -26,7 +26,8 @@ POLICIES = Names("value.policy", "POLICIES")
 PROGRAMS = Names("loop.programs", "PROGRAMS")
 GRADIENTS = Names("loop.rollout", "GRADIENTS")
 METHODS = Names("loop.rollout", "METHODS")
-CONTROL_SETS = Names("task.sets", "CONTROL_SETS")
+CONTROL_SETS = Names("task.control_sets", "CONTROL_SETS")
+CONTROL_COSTS = Names("task.cost.control_costs", "CONTROL_COSTS")
 SYSTEMS = Names("task.systems", "SYSTEMS")
 SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
@@ -102,6 +103,9 @@ class CostConfig:
         None, "δ: 2δ²(√(1 + q/δ²) − 1) replaces q, and likewise φ, for less growth far away.", above=0
     )
     obstacles: list[dict[str, Any]] = setting([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
+    control_costs: list[dict[str, Any]] = setting(
+        [], "Costs of controls beside uᵀRu, each as {name: …, weight: …}: absolute, norm, power, …"
+    )
     parameters: dict[str, Any] = setting({}, "Arguments of the constructor of a cost of your own.")
 
 

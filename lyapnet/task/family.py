@@ -195,7 +195,7 @@ class FamilyCost(Cost):
         self.cost, self.targets, self.n, self.R_of_member = cost, targets, n, R
         self.weights, self.logarithms = weights, list(logarithms)
         self.goal = torch.cat([center.new_zeros(n) if cost.goal is None else cost.goal, center])
-        self.rest = cost.rest
+        self.rest, self.nonquadratic = cost.rest, cost.nonquadratic
         if weights is None or "R" not in weights.matrices:
             self.R_constant, self.R_inverse = cost.R_constant, cost.R_inverse
 

@@ -174,11 +174,16 @@ class Problem(nn.Module):
 
     def rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The means of ẋ and ℓ over one step from x with u held, by the integrator of the horizon."""
+        rate, cost = self.smooth_rates(x, u)
+        return rate, cost if self.cost.nonquadratic is None else cost + self.cost.beside(u)
+
+    def smooth_rates(self, x: State, u: Control) -> tuple[State, PerState]:
+        """The same without s(u), the cost of controls beside uᵀRu."""
         tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
         for row in tableau.a:
             X = x + self.horizon.dt * weighted_sum(row, slopes) if any(row) else x
             slopes.append(self.system.dynamics(X, u))
-            costs.append(self.cost.running(X, u))
+            costs.append(self.cost.smooth_running(X, u))
         return weighted_sum(tableau.b, slopes), weighted_sum(tableau.b, costs)
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
@@ -186,8 +191,22 @@ class Problem(nn.Module):
         rate, cost = self.rates(x, u)
         return x + self.horizon.dt * rate, self.horizon.dt * cost
 
+    def smooth_step(self, x: State, u: Control) -> tuple[State, PerState]:
+        """The same without s(u), the cost of controls beside uᵀRu, which may have kinks."""
+        rate, cost = self.smooth_rates(x, u)
+        return x + self.horizon.dt * rate, self.horizon.dt * cost
+
+    def best_control(self, W: Tensor, b: Control) -> Control:
+        """argmin over u ∈ U of uᵀWu + bᵀu + s(u), (*batch, m), for W (*batch, m, m) and b (*batch, m)."""
+        return self.cost.best_control(self.controls, W, b)
+
+    @property
+    def has_linear_law(self) -> bool:
+        """Whether argmin over u ∈ U of uᵀWu + bᵀu + s(u) is −½W⁻¹b: U = ℝᵐ and s = 0."""
+        return not self.controls.limited and self.cost.nonquadratic is None
+
     def response(self, x: State, u: Control | None = None) -> Response:
-        """The derivatives of one step from x by u.
+        """The derivatives of one step from x by u, without s(u), the cost of controls beside uᵀRu.
 
         Args:
             u: the control at which they are taken; None: u*, the control at rest.
@@ -201,12 +220,12 @@ class Problem(nn.Module):
             u = u if recording and u.requires_grad else u.detach().requires_grad_()
             # one copy of u for each component of ẋ: all rows of the Jacobian in one backward pass
             copies = u.expand(n, *u.shape)
-            rate = self.rates(x.expand(n, *x.shape), copies)[0]
+            rate = self.smooth_rates(x.expand(n, *x.shape), copies)[0]
             rows = (
                 torch.eye(n, dtype=rate.dtype, device=rate.device).reshape(n, *[1] * (rate.ndim - 2), n).expand_as(rate)
             )
             (by_control,) = torch.autograd.grad(rate, copies, rows, create_graph=recording)
-            (slope,) = torch.autograd.grad(self.rates(x, u)[1].sum(), u, create_graph=True)
+            (slope,) = torch.autograd.grad(self.smooth_rates(x, u)[1].sum(), u, create_graph=True)
             bends = [torch.autograd.grad(s.sum(), u, create_graph=True)[0] for s in slope.unbind(-1)]
         parts = (
             x + self.horizon.dt * rate[0],
@@ -321,7 +340,7 @@ class Problem(nn.Module):
                 f"Expected {name}.dynamics(x, u) = f(x) + g(x)u, got another sum; a class that overrides f or g of "
                 "another system may have to override its dynamics too."
             )
-        u = own.controls.minimise(cost.R(x), 100 * b)
+        u = own.best_control(cost.R(x), 100 * b)
         if not torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9):
             raise UsageError(
                 f"Expected {type(own.controls).__name__}.minimise(R, b) in the set, got a control outside, which "
@@ -349,7 +368,7 @@ class Problem(nn.Module):
         """Call all functions of the parts at some states, to detect side effects."""
         system, cost = self.system, self.cost
         R, u = cost.R(x), torch.ones_like(x[..., :1]).expand(*x.shape[:-1], system.m)
-        u = self.controls.project(self.controls.minimise(R, u))
+        u = self.controls.project(self.best_control(R, u))
         _ = system.dynamics(x, u), cost.running(x, u), cost.terminal(x), self.controls.contains(u), self.rates(x, u)
         if self.constraints is not None:
             self.constraints(x)
@@ -426,6 +445,8 @@ class Problem(nn.Module):
             }  # fmt: skip
         if (rest := cost.rest_at(x)) is not None:
             numbers["u*"] = rest.expand(3, m)
+        if cost.nonquadratic is not None:
+            numbers["s"] = cost.beside(own.best_control(torch.eye(m, dtype=x.dtype).expand(3, m, m), b))
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
         if own.noise is not None:
@@ -454,6 +475,9 @@ class Problem(nn.Module):
             unsaid["σσᵀ"], own = none, {"σσᵀ": none, **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}
+        unsaid["s"] = [0.0] * 3
+        if "s" in record:
+            own = {"s": unsaid["s"], **own}
         if "risk" in record:
             own = {"risk": [0.0], **own}
         return [name for name, value in own.items() if not _agree(record.get(name, unsaid.get(name)), value)]

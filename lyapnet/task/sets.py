@@ -115,7 +115,19 @@ class ControlSet(nn.Module, ABC):
 
     @property
     def limits(self) -> tuple[Tensor, Tensor] | None:
-        """(lower, upper), each () or (m,), if U is a box, as oracles and the initial V need it; else None."""
+        """(lower, upper), each () or (m,), of the smallest box around U, as oracles and the initial V need it.
+
+        None if it is not known, and U is then no set that they take.
+        """
+        return None
+
+    @property
+    def is_box(self) -> bool:
+        """Whether U is all of the box of its `limits`."""
+        return True
+
+    def excess(self, u: Control) -> Tensor | None:
+        """Smooth functions (*batch, k) of u that are ≤ 0 in U, beside its `limits`; None if there are none."""
         return None
 
     @abstractmethod
@@ -228,9 +240,22 @@ class ControlBox(ControlSet):
             raise ValueError(f"Expected limits of {m} controls, got {self.lower.numel()}; give one for each.")
         if m == 1:
             return self.project(-b / (2 * R[..., 0]))
+        return self._minimise_between(R, b, self.lower, self.upper)
+
+    def minimise_in_orthant(self, R: ControlMatrix, b: Control, signs: Float[Tensor, " m"]) -> Control:
+        """argmin of uᵀRu + bᵀu over the controls of U with some signs (m,), each 1 or −1.
+
+        A control that U does not let have its sign is at its limit on the other side.
+        """
+        low = torch.where(signs > 0, self.lower.clamp_min(0), self.lower)
+        high = torch.maximum(torch.where(signs < 0, self.upper.clamp_max(0), self.upper), low)
+        return self._minimise_between(R, b, torch.minimum(low, self.upper), high)
+
+    def _minimise_between(self, R: ControlMatrix, b: Control, low: Tensor, high: Tensor) -> Control:
+        """argmin of uᵀRu + bᵀu over low ≤ u ≤ high, for more than one control."""
         # in double precision, because the cost differences may be too small for single precision
-        given, low, high = b, self.lower.double().expand(m), self.upper.double().expand(m)
-        R, b = R.double(), b.double()
+        m, given = b.shape[-1], b
+        R, b, low, high = R.double(), b.double(), low.double().expand(m), high.double().expand(m)
         if m == 2:
             return self._minimise_two(R, b, low, high).to(given)
         few = m <= ENUMERATED_CONTROLS and not are_operators()
@@ -380,7 +405,3 @@ ENUMERATED_CONTROLS = 4  # up to this number all combinations are tried: 3⁴ = 
 ACTIVE_SET_ROUNDS = 4  # rounds of the active-set method for each control
 SIMULTANEOUS_ROUNDS = 8  # rounds in which all controls may change at once; as many for each control follow
 FINITE_LIMIT = 1e150  # replaces an infinite limit in products
-
-CONTROL_SETS: dict[str, type[ControlSet]] = {
-    "unbounded": Unbounded
-}  # a ControlBox is chosen by controls.lower and upper

@@ -16,7 +16,7 @@ from lyapnet.base.types import Control, PerState, State, StatePath
 from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
 from lyapnet.task.problem import Problem
-from lyapnet.task.sets import ControlSet, Unbounded
+from lyapnet.task.sets import Unbounded
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
@@ -205,7 +205,7 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
         values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
         W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
-        return answer.x, B, answer.slope, W, _control_set_of_fit(problem).minimise(W / 2, b - apply(W, about))
+        return answer.x, B, answer.slope, W, _best_control_of_fit(problem, W / 2, b - apply(W, about))
 
     about = problem.rest_at(now)
     led, B, slope, W, best = responses(about)
@@ -223,7 +223,7 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
 def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tensor, Tensor]:
     """The mean squared value error (V − V*)²/J², and the mean excess cost T/J (Q(u*) − min over u ∈ U of Q(u)).
 
-    Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c), b = BᵀV_x + ℓ_u, is the second order cost per second of a control u
+    Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) + s(u), b = BᵀV_x + ℓ_u, is the second order cost per second of a control u
     predicted by V. The excess is zero if V yields the optimal control u*; it is convex in V_x with slope B(u* − u).
     Without control limits it is ½ (b − b*)ᵀW⁻¹(b − b*), the excess cost of V's law. An error of V_x that leaves u at
     its limit costs nothing. For a stationary V, V* replaces J, ℓ at each state replaces J/T, and limits are ignored.
@@ -233,8 +233,9 @@ def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tens
     t, x, value, after, about, led, B, slope, W, best, cost, rate = examples
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = _control_set_of_fit(problem).minimise(W / 2, b - apply(W, about))
-    excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
+        u = _best_control_of_fit(problem, W / 2, b - apply(W, about))
+        besides = problem.cost.beside(best) - problem.cost.beside(u)
+    excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1) + besides  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
 
 
@@ -252,12 +253,12 @@ class _Misfit(nn.Module):
         return VALUE_WEIGHT * value_error + excess
 
 
-def _control_set_of_fit(problem: Problem) -> ControlSet:
-    """The controls over which Q is minimised: U, or ℝᵐ for a stationary V.
+def _best_control_of_fit(problem: Problem, W: Tensor, b: Control) -> Control:
+    """argmin of uᵀWu + bᵀu + s(u) over U, or over ℝᵐ for a stationary V.
 
     A stationary V has to decrease wherever u is; without limits its slope is fitted at the limits of u too.
     """
-    return Unbounded() if problem.horizon.stationary else problem.controls
+    return problem.cost.best_control(Unbounded() if problem.horizon.stationary else problem.controls, W, b)
 
 
 def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:

@@ -221,8 +221,9 @@ def _system_fact(problem: Problem) -> Fact:
     system, controls = problem.system, problem.controls
     limits = ""
     if controls.limited:
-        sides = None if controls.limits is None else [_format_vector(side.expand(system.m)) for side in controls.limits]
-        limits = f" in {type(controls).__name__}" if sides is None else f" between {sides[0]} and {sides[1]}"
+        box = controls.limits if controls.is_box else None
+        sides = None if box is None else [_format_vector(side.expand(system.m)) for side in box]
+        limits = f" in {controls}" if sides is None else f" between {sides[0]} and {sides[1]}"
     return Fact(
         "system",
         f"{system.title}: {_format_count(system.n, 'state')}, {_format_count(system.m, 'control')}{limits}",

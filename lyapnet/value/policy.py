@@ -66,9 +66,9 @@ class HJBPolicy(ValuePolicy):
     def _minimise(self, x: State, V_x: State) -> Control:
         b = input_lie_derivative(self.system, x, V_x)
         rest = self.cost.rest_at(x)
-        if self.controls.limited:
+        if self.controls.limited or self.cost.nonquadratic is not None:
             R = self.cost.R(x)
-            return self.controls.minimise(R, about_control(R, b, rest))
+            return self.cost.best_control(self.controls, R, about_control(R, b, rest))
         u = -0.5 * self.cost.solve_R(x, b)  # a constant R is inverted only once
         return u if rest is None else u + rest
 
@@ -97,6 +97,10 @@ class SontagPolicy(ValuePolicy):
             raise ValueError(
                 f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
                 "rollout.policy=hjb or sampled."
+            )
+        if problem.cost.nonquadratic is not None:
+            raise ValueError(
+                "Expected controls that cost uᵀRu for Sontag's formula, got more; take rollout.policy=hjb or sampled."
             )
         super().__init__(problem, V)
 
@@ -223,7 +227,7 @@ class _HeldStep:
             V_x = self.V.value_and_state_gradient(self.after, z)[1]
             curvature = self._curvature(answer, z, V_x, H)
         slope = apply(answer.by_control.mT, V_x) + answer.slope
-        return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
+        return self.problem.best_control(curvature / 2, slope - apply(curvature, u.detach()))
 
     def _step_values(self, u: Control) -> PerState:
         """Q of controls (k, *batch, m)."""

@@ -12,8 +12,8 @@ from lyapnet import cli
 from lyapnet.cli import main
 from lyapnet.loop.programs import PROGRAMS
 from lyapnet.task.constraints import CONSTRAINTS
+from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import COSTS
-from lyapnet.task.sets import CONTROL_SETS
 from lyapnet.task.systems import SYSTEMS
 from lyapnet.value.networks import NETWORKS
 

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
+from lyapnet.task.ball import ControlBall
+from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import QuadraticCost
-from lyapnet.task.sets import CONTROL_SETS, Box, ControlBox, Unbounded
+from lyapnet.task.sets import Box, ControlBox, Unbounded
 from tests.marks import at_the_gate
 
 
@@ -135,7 +137,9 @@ def test_only_the_unbounded_set_itself_has_no_limits():
     assert Halved().limited, "else its own law would be passed over, and an optimum without limits be its own"
 
 
-SETS = {**CONTROL_SETS, "box": lambda: ControlBox([-0.3, -0.1], [0.1, 0.4])}
+SETS = {
+    **CONTROL_SETS, "box": lambda: ControlBox([-0.3, -0.1], [0.1, 0.4]), "ball": lambda: ControlBall(0.3),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("controls", SETS.values(), ids=SETS)

@@ -1,6 +1,7 @@
-"""A task as CasADi functions, for nonlinear programming: its step, its terminal cost and its constraints."""
+"""A task as CasADi functions, for nonlinear programming: its step, its terminal cost, its constraints and controls."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import casadi
 import torch
@@ -10,15 +11,24 @@ from torch.fx import GraphModule
 from lyapnet.base.types import Control, PerState, State
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.graphs.tracing import Tensors
+from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCost, ControlCosts, PowerCost
 from lyapnet.task.problem import Problem
 
 
+class TermsOfControls(NamedTuple):
+    """What the controls of a plan add to a nonlinear program."""
+
+    cost: casadi.MX  # per second
+    variables: casadi.MX  # ≥ 0
+    inequalities: casadi.MX  # ≤ 0
+
+
 class CasadiTask:
-    """The torch functions translated to CasADi: (x_n, u_n) ↦ (x_{n+1}, ∫ℓ), x_N ↦ φ and x ↦ h.
+    """The torch functions translated to CasADi: (x_n, u_n) ↦ (x_{n+1}, ∫ℓ), x_N ↦ φ and x ↦ h, and those of u.
 
     Attributes:
         graphs: the torch traces of these functions.
-        step, end, inside: the CasADi functions; inside is None without constraints.
+        step, end, inside: the CasADi functions; ∫ℓ is without s(u), and inside is None without constraints.
 
     Args:
         problem: in float64 on the CPU.
@@ -34,10 +44,12 @@ class CasadiTask:
         self.step = self._translate(self.step_in_torch, (x, u))
         self.end = self._translate(self.end_in_torch, (x,))
         self.inside = None if problem.constraints is None else self._translate(self.inside_in_torch, (x,))
+        self._excess = None if problem.controls.excess(u) is None else self._translate(self.excess_in_torch, (u,))
+        self._smooth, self._kinked = self._costs_of_controls(u)
 
     def step_in_torch(self, x: State, u: Control) -> tuple[State, PerState]:
-        """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
-        return self.problem.step(x, u)
+        """(x_{n+1}, ∫ℓ over the step) without s(u); with Euler (x_n + Δt(f + gu), Δt (q + uᵀRu))."""
+        return self.problem.smooth_step(x, u)
 
     def end_in_torch(self, x: State) -> tuple[PerState]:
         """(φ(x_N),)."""
@@ -47,6 +59,56 @@ class CasadiTask:
         """(h(x_n),)."""
         assert self.problem.constraints is not None
         return (self.problem.constraints(x),)
+
+    def excess_in_torch(self, u: Control) -> tuple[Tensor]:
+        """(what is ≤ 0 in U beside its limits,)."""
+        excess = self.problem.controls.excess(u)
+        assert excess is not None
+        return (excess,)
+
+    @property
+    def is_program_of_steps(self) -> bool:
+        """Whether `step`, `end`, `inside` and limits of controls are the whole task."""
+        return self._excess is None and not self._kinked and self._smooth is None
+
+    def terms_of_controls(self, u: casadi.MX, scale: casadi.MX) -> "TermsOfControls":
+        """The cost per second Σ s(u_n) and the inequalities for controls (m, N), whose size is `scale` (m,).
+
+        |uᵢ| and ‖u‖ are variables of their own, at least as large as these, where slopes jump or bend without end at 0.
+        """
+        steps = u.shape[1]
+        cost, variables, inequalities = casadi.MX(0), list[casadi.MX](), list[casadi.MX]()
+        if self._smooth is not None:
+            cost += casadi.sum2(self._smooth.map(steps)(u))
+        if self._excess is not None:
+            inequalities.append(casadi.vec(self._excess.map(steps)(u)))
+        for part in self._kinked:
+            weight = part.weight.double()
+            if isinstance(part, AbsoluteCost | PowerCost):
+                size, p = casadi.MX.sym("size", *u.shape), part.exponent if isinstance(part, PowerCost) else 1.0
+                scaled = casadi.diag(1 / scale) @ u
+                inequalities += [casadi.vec(scaled - size), casadi.vec(-scaled - size)]
+                cost += casadi.sum1(casadi.DM(weight.expand(u.shape[0]).numpy()) * scale**p * casadi.sum2(size**p))
+            else:
+                size, of_all = casadi.MX.sym("size", 1, steps), casadi.norm_2(scale)
+                inequalities.append(casadi.vec(casadi.sum1((u / of_all) ** 2) - size**2))
+                cost += float(weight) * of_all * casadi.sum2(size)
+            variables.append(casadi.vec(size))
+        return TermsOfControls(cost, casadi.veccat(*variables), casadi.veccat(*inequalities))
+
+    def _costs_of_controls(self, u: Control) -> tuple[casadi.Function | None, list[ControlCost]]:
+        """The sum of smooth costs of controls translated, and the costs with kinks or an infinite curvature."""
+        own = self.problem.cost.nonquadratic
+        if own is None:
+            return None, []
+        self.graphs.append(traced(lambda u: (own(u),), (u,)))  # which identifies the task
+        kinked: list[ControlCost] = [
+            *own.kinked, *(part for part in own.separable if isinstance(part, PowerCost) and part.exponent < 2)
+        ]  # fmt: skip
+        smooth = [part for part in own.separable if part not in kinked]
+        if not smooth:
+            return None, kinked
+        return self._translate(lambda u: (ControlCosts(smooth)(u),), (u,)), kinked
 
     def _translate(self, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> casadi.Function:
         self.graphs.append(traced(function, arguments))

@@ -23,6 +23,7 @@ from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, SAME, Candidate, MultiStart, is_better
 from lyapnet.evaluation.oracles.scales import Scales
+from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
@@ -77,7 +78,7 @@ class Transcription(Oracle):
         limits = self.problem.controls.limits
         domain = self.problem.domain
         bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
-        self._limit, self._solver = _solver(self.task, horizon.steps, iterations, bounded)
+        self._limit, self._solver, sizes, inequalities = _solver(self.task, horizon, iterations, bounded)
         self._iterations = iterations
         self._most_iterations = 0  # largest number of iterations of a first minimum; 0: none yet
         self._scales = Scales(self.problem)
@@ -88,13 +89,14 @@ class Transcription(Oracle):
             np.concatenate([
                 np.tile(side.expand(system.m).numpy() / self._scales.of_controls, horizon.steps),
                 np.tile(end.numpy() / self._scales.of_states, horizon.steps),
+                np.full(sizes, size),
             ])
-            for side, end in zip(limits, ends, strict=True)
+            for side, end, size in zip(limits, ends, (0.0, np.inf), strict=True)
         ]  # fmt: skip
-        # bounds of the constraints: defects of the steps = 0, h ≤ 0
-        more = 0 if self.task.inside is None else horizon.steps * self.task.inside.size1_out(0)
+        self._sizes = sizes
+        # bounds of the constraints: defects of the steps = 0, h ≤ 0 and the inequalities of controls
         defects = np.zeros(system.n * horizon.steps)
-        self._held = [np.concatenate([defects, np.full(more, side)]) for side in (-np.inf, 0.0)]
+        self._held = [np.concatenate([defects, np.full(inequalities, side)]) for side in (-np.inf, 0.0)]
 
     def rollout(self, x0: State, u: ControlPath) -> tuple[StatePath, PerState]:
         """(x, J_N) under given controls, computed in torch."""
@@ -223,7 +225,7 @@ class Transcription(Oracle):
     def _minimum(self, x0: np.ndarray, start: Candidate, iterations: int) -> Candidate | str:
         lower, upper = self._bounds
         of_x, of_u, scale = self._scales.of_states, self._scales.of_controls, self._scales.of_cost(x0)
-        guess = np.concatenate([(start.u / of_u).ravel(), (start.x / of_x).ravel()])
+        guess = np.concatenate([(start.u / of_u).ravel(), (start.x / of_x).ravel(), np.ones(self._sizes)])
         given = np.concatenate([x0, [scale], of_x, of_u])
         least, greatest = self._held
         self._limit.start(iterations)
@@ -234,7 +236,7 @@ class Transcription(Oracle):
             self._stop()
         if status not in CONVERGED:
             return f"IPOPT: {'Maximum_Iterations_Exceeded' if self._limit.is_reached() else status}"
-        u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
+        u, x, _ = np.split(np.asarray(result["x"]).ravel(), [start.u.size, start.u.size + start.x.size])
         u = of_u * u.reshape(start.u.shape)
         u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # IPOPT may slightly violate U
         return Candidate(of_x * x.reshape(start.x.shape), u, scale * float(result["f"]))
@@ -306,19 +308,26 @@ class _IterationLimit(casadi.Callback):
         return [int(self.is_reached())]
 
 
-def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> tuple[_IterationLimit, casadi.Function]:
-    """The iteration limit, and IPOPT for the transcribed task with exact sparse derivatives.
+def _solver(
+    task: CasadiTask, horizon: Horizon, iterations: int, limited: bool
+) -> tuple[_IterationLimit, casadi.Function, int, int]:
+    """The iteration limit, IPOPT for the transcribed task with exact sparse derivatives, and two numbers.
 
-    The variables are the scaled (u, x); the parameters are x₀, the scale of J, and the scales of x and u.
+    The variables are the scaled (u, x), and sizes of controls; the parameters are x₀, the scale of J, and the scales of
+    x and u. The numbers are those of the sizes, and of the inequalities.
     """
+    steps = horizon.steps
     n, m = task.step.size1_in(0), task.step.size1_in(1)
     x0, scaled_x, scaled_u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
     scale, of_x, of_u = casadi.MX.sym("scale"), casadi.MX.sym("of_x", n), casadi.MX.sym("of_u", m)
     x, u = casadi.diag(of_x) @ scaled_x, casadi.diag(of_u) @ scaled_u
     following, step_cost = task.step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
-    J = casadi.sum2(step_cost) + task.end(x[:, -1])
-    variables, zero = casadi.veccat(scaled_u, scaled_x), casadi.vec(casadi.diag(1 / of_x) @ (following - x))
-    held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
+    of_controls = task.terms_of_controls(u, of_u)
+    J = casadi.sum2(step_cost) + task.end(x[:, -1]) + horizon.dt * of_controls.cost
+    variables = casadi.veccat(scaled_u, scaled_x, of_controls.variables)
+    zero = casadi.vec(casadi.diag(1 / of_x) @ (following - x))
+    inside = casadi.MX(0, 1) if task.inside is None else casadi.vec(task.inside.map(steps)(x))
+    held = casadi.veccat(zero, inside, of_controls.inequalities)
     problem = {"x": variables, "p": casadi.vertcat(x0, scale, of_x, of_u), "f": J / scale, "g": held}
     # tight: an unstable system amplifies errors of the controls, and the barrier changes J; limits are not relaxed
     exact = {"ipopt.tol": 1e-10, **({"ipopt.bound_relax_factor": 0.0} if limited else {})}
@@ -334,4 +343,5 @@ def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> tup
         "ipopt.acceptable_iter": 5,
     }
     options = {**quiet, **exact, **acceptable, **ends}
-    return limit, casadi.nlpsol("transcription", "ipopt", problem, options)
+    solver = casadi.nlpsol("transcription", "ipopt", problem, options)
+    return limit, solver, of_controls.variables.numel(), held.numel() - zero.numel()

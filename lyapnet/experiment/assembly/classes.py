@@ -16,8 +16,9 @@ from lyapnet.base.errors import LyapnetError, UsageError, did_you_mean, raised
 from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import PROGRAMS, Program
 from lyapnet.task.constraints import CONSTRAINTS, Constraints
+from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import COSTS, Cost
-from lyapnet.task.sets import CONTROL_SETS, ControlSet
+from lyapnet.task.sets import ControlSet
 from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import NETWORKS

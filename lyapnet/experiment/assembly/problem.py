@@ -14,6 +14,7 @@ from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.types import State
 from lyapnet.experiment.assembly.classes import DTYPES, Parts, float64_defaults, instance_of, section
 from lyapnet.experiment.assembly.constraints import ball_of, build_constraints, choose_margins
+from lyapnet.experiment.assembly.control_costs import KEY, control_costs_of, within_open_limits
 from lyapnet.experiment.assembly.domain import in_domain
 from lyapnet.experiment.assembly.entries import index_of, repeated, require_length, rows
 from lyapnet.experiment.assembly.family import family_of
@@ -73,6 +74,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
+        controls = _with_control_costs(config, cost, controls, system.m)
         require_points(config.reference)
         if config.reference.points:
             system, cost, initial_states = reference_of(config, system, cost, controls, initial_states)
@@ -211,6 +213,24 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
         require_length(f"cost.{key}", len(weight), system.state_names)
     cost = QuadraticCost(R=R, **weights)
     return _make_periodic(config.periodic, cost, system) if config.periodic else cost
+
+
+def _with_control_costs(config: Config, cost: Cost, controls: ControlSet, m: int) -> ControlSet:
+    """Add the listed costs of controls to a cost; returns the controls at which they are finite.
+
+    Raises:
+        UsageError: the costs and the control set have no known minimiser, or the task is stationary.
+    """
+    costs = control_costs_of(config.cost, m)
+    if costs is None:
+        return controls
+    if config.horizon.stationary:
+        raise UsageError(f"Expected no {KEY} with horizon.stationary, got some; its regulator knows uᵀRu alone.")
+    cost.nonquadratic = costs
+    controls = within_open_limits(controls, costs, m)
+    with section(KEY):
+        costs.require_minimiser(controls, m)
+    return controls
 
 
 def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:

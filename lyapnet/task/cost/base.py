@@ -3,6 +3,7 @@
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -12,23 +13,27 @@ from torch import Tensor, nn
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, solve
 from lyapnet.base.types import Control, ControlMatrix, Matrix, PerState, State
+from lyapnet.task.cost.control_costs import ControlCosts
+from lyapnet.task.sets import ControlSet
 
 BUFFERS = ("goal", "rest", "R_constant", "R_inverse")  # properties of a cost; each may be None
 
 
 class Cost(nn.Module, ABC):
-    """The running cost ℓ(x, u) = q(x) + uᵀR(x)u in cost per second, and the terminal cost φ(x).
+    """The running cost ℓ(x, u) = q(x) + uᵀR(x)u + s(u) in cost per second, and the terminal cost φ(x).
 
-    q and φ are smooth, R(x) is symmetric positive definite. A subclass implements `state`, `R` and `terminal` with
-    torch operations on tensors of any leading shape. It may set `goal` and the other properties below in its body, as
-    in `goal = [1.0, 0.0]`, or in `__init__`. With a target, u − u* replaces u, see TargetCost. If q and φ vanish at a
-    goal and are nowhere negative, V measures the distance to it; a profit or a harvest has no goal.
+    q and φ are smooth, R(x) is symmetric positive definite, s is convex and usually absent, see ControlCosts. A
+    subclass implements `state`, `R` and `terminal` with torch operations on tensors of any leading shape. It may set
+    `goal` and the other properties below in its body, as in `goal = [1.0, 0.0]`, or in `__init__`. With a target,
+    u − u* replaces u in uᵀRu, see TargetCost. If q and φ vanish at a goal and are nowhere negative, V measures the
+    distance to it; a profit or a harvest has no goal.
     """
 
     goal: Float[Tensor, " n"] | None  # state at which q and φ vanish, if there is one; None: the origin
     rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing (at the goal, see rest_at); None: zero
     R_constant: Matrix | None  # R, if it is the same at every state
     R_inverse: Matrix | None  # its inverse
+    nonquadratic: ControlCosts | None  # s, the cost of controls beside uᵀRu; None: there is none
 
     _declared: ClassVar[Mapping[str, Any]] = {}  # values of these buffers that are set in the body of a class
 
@@ -49,6 +54,7 @@ class Cost(nn.Module, ABC):
                 value = self._declared.get(name)
                 as_tensor = None if value is None else torch.as_tensor(value, dtype=torch.get_default_dtype()).clone()
                 self.register_buffer(name, as_tensor, persistent=False)
+        self.nonquadratic = None
 
     @abstractmethod
     def state(self, x: State) -> PerState:
@@ -79,13 +85,33 @@ class Cost(nn.Module, ABC):
         return gradient
 
     def control(self, x: State, u: Control) -> PerState:
-        """uᵀR(x)u, or (u − u*)ᵀR(x)(u − u*)."""
+        """uᵀR(x)u, or (u − u*)ᵀR(x)(u − u*); without s(u)."""
         rest = self.rest_at(x)
         return quadratic_form(self.R(x), u if rest is None else u - rest)
 
-    def running(self, x: State, u: Control) -> PerState:
-        """ℓ(x, u) = q(x) + uᵀR(x)u, in cost per second."""
+    def smooth_running(self, x: State, u: Control) -> PerState:
+        """q(x) + uᵀR(x)u, the running cost without s(u)."""
         return self.state(x) + self.control(x, u)
+
+    def running(self, x: State, u: Control) -> PerState:
+        """ℓ(x, u) = q(x) + uᵀR(x)u + s(u), in cost per second."""
+        cost = self.smooth_running(x, u)
+        return cost if self.nonquadratic is None else cost + self.nonquadratic(u)
+
+    def beside(self, u: Control) -> PerState:
+        """s(u), the cost of controls beside uᵀRu, (*batch,)."""
+        return torch.zeros_like(u[..., 0]) if self.nonquadratic is None else self.nonquadratic(u)
+
+    def best_control(self, controls: ControlSet, W: ControlMatrix, b: Control) -> Control:
+        """argmin over u ∈ U of uᵀWu + bᵀu + s(u), (*batch, m).
+
+        Args:
+            controls: U.
+            W: (*batch, m, m), symmetric positive definite.
+            b: (*batch, m).
+        """
+        minimise = controls.minimise if self.nonquadratic is None else partial(self.nonquadratic.minimise, controls)
+        return minimise(W, b)
 
     def solve_R(self, x: State, v: Control) -> Control:
         """R(x)⁻¹v."""

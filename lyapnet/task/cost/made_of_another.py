@@ -24,6 +24,7 @@ class MadeOfAnother(Cost):
         self.cost = cost
         for name in BUFFERS:
             self.register_buffer(name, getattr(cost, name), persistent=False)
+        self.nonquadratic = cost.nonquadratic
 
     def state(self, x: State) -> PerState:
         return self.cost.state(x)

@@ -82,9 +82,10 @@ class QuadraticCost(Cost):
 
 
 def is_quadratic(cost: Cost) -> TypeGuard[QuadraticCost]:
-    """Whether a cost is determined by its matrices: no subclass or instance replaces one of its functions."""
+    """Whether a cost is determined by its matrices: no function of it is another, and controls cost uᵀRu alone."""
     own = ("state", "R", "terminal", "control", "running", "ignores")
-    return all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
+    own_functions = all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
+    return own_functions and cost.nonquadratic is None
 
 
 def _symmetric(name: str, rows: Sequence[Sequence[float]] | Tensor, *, definite: bool) -> Tensor:

@@ -25,13 +25,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.base.linear_algebra import is_positive_definite, solve
-from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
+from lyapnet.base.contracts import copied
+from lyapnet.base.types import ControlPath, PerState, State, StatePath
 from lyapnet.task.cost import PenaltyCost, spread
 from lyapnet.task.noise import Noise, once_if_constant
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
 from lyapnet.value.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
+from lyapnet.value.expansions.gains import as_matrix, cost_beside, gain_of_node, regularise
 from lyapnet.value.expansions.laws import Expansion, certainty_equivalents, greedy_law
 from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 from lyapnet.value.expansions.step_programs import StepPrograms
@@ -44,7 +45,7 @@ GAIN_TOLERANCE = 1e-9  # relative gain of a line search at which the phase with 
 EXPECTED_TOLERANCE = 1e-12  # relative expected gain at which it ends
 HOPELESS_COST_RATIO = 2.0  # cost relative to a settled rival, from which on a trajectory is given up
 GRACE_ITERATIONS = 20  # first iterations in which none is given up
-ROUNDING = 1e-12  # eigenvalues of Q_uu below this share of the largest are only rounding errors
+SOFTNESS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # ρ of softer costs of controls, in units of that of their kinks
 TRIES = 9  # consecutive failed line searches, each with ten times the damping, after which a trajectory is given up
 
 
@@ -98,7 +99,9 @@ def _at_goal(problem: Problem, goal: State | None = None) -> "Backward":
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     center = problem.goal if goal is None else goal
     x, u = center.expand(N + 1, -1), problem.rest_at(center).expand(N, -1)
-    return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False, noise=problem.noise)
+    return _backward(
+        problem, StepDerivatives(problem.smooth_step, problem.system.n), x, u, curved=False, noise=problem.noise
+    )
 
 
 def optimal_trajectories(
@@ -143,6 +146,8 @@ def optimal_trajectories(
         rough = StepPrograms(roughly, STEP_SIZES)
         euler = descend(rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
+    if problem.cost.nonquadratic is not None:
+        now = cheapest([now, under(_from_softer_costs(problem, under, descend, now.u))])
     programs = StepPrograms(problem, STEP_SIZES)
     now = descend(programs, now, curved=False, kind=kinds - 2).now
     descent = descend(programs, now, curved=True, kind=kinds - 1)
@@ -150,6 +155,28 @@ def optimal_trajectories(
         problem = problem if noise is None else problem.replaced(noise=noise)
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     return descent.optimum(noise)
+
+
+def _from_softer_costs(
+    problem: Problem, under: Callable[..., Path], descend: Callable[..., "_Descent"], u: ControlPath
+) -> ControlPath:
+    """Controls that were optimal as long as ρ‖u‖² was added to a cost of controls with kinks, with ρ falling to zero.
+
+    Across a kink or between limits an optimum jumps, which quadratic models do not tell.
+
+    Source: Bertrand, Epenoy, "New smoothing techniques for solving bang-bang optimal control problems", Optimal Control
+    Applications and Methods 2002.
+    """
+    softer = copied(problem)
+    costs, start = softer.cost.nonquadratic, softness_of_kinks(problem)
+    if costs is None or not start:
+        return u
+    softness = costs.softness
+    programs = StepPrograms(softer, STEP_SIZES)
+    for share in SOFTNESS:
+        softness.fill_(share * start)
+        u = descend(programs, under(u, softer), curved=False, kind=0).now.u
+    return u
 
 
 def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
@@ -258,6 +285,17 @@ def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Te
         return value.detach(), gradient.detach(), jacobian(gradient, z)
 
 
+def softness_of_kinks(problem: Problem) -> float:
+    """ρ at which ρ‖u‖² of the largest controls costs as much as the kinks of their cost; 0 without kinks."""
+    costs = problem.cost.nonquadratic
+    if costs is None or not costs.kinked:
+        return 0.0
+    weight = float(sum(cost.weight.max() for cost in costs.kinked))
+    R = float(torch.linalg.eigvalsh(problem.cost.R(problem.initial_states.center))[..., 0])
+    largest = [weight / R, *(float(side.abs().max()) for side in problem.controls.limits or ())]
+    return weight / min(largest)
+
+
 def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
     """An expansion of V minus the constraint penalty of one step at each state."""
     value, gradient, hessian = penalty_of_one_step(in_float64(problem), expansion.x)
@@ -308,8 +346,8 @@ def backward_recursion(
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
     one = torch.eye(1, 1 + steps.z.shape[-1]).to(x).expand(*steps.paid.shape, 1, -1)
     M = torch.cat([one, torch.cat([(steps.F - x[1:])[..., None], steps.F_z], -1)], -2)
-    L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
-    W = _quadratic(*steps.end)
+    L = as_matrix(steps.paid, steps.l_z, steps.l_zz)
+    W = as_matrix(*steps.end)
     spread, S = (None, None) if noise is None else _spread_and_maps(problem, noise, x[:-1])
     sigma = None if noise is None or not problem.risk else noise(x[:-1])
     nodes, gains = [W], []
@@ -321,9 +359,11 @@ def backward_recursion(
         if S is not None:
             Q[..., : 1 + n, : 1 + n] += (S[k].mT @ W[..., None, 1:, 1:] @ S[k]).sum(-3)
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
-        regularised = _regularised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
-        gain = _gains(problem, u[k], regularised, Q_ua)
+        regularised = regularise(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
+        gain = gain_of_node(problem, u[k], regularised, Q_ua)
         W = Q[..., : 1 + n, : 1 + n] + gain.mT @ (Q_ua + Q_uu @ gain) + Q_ua.mT @ gain
+        if problem.cost.nonquadratic is not None:
+            W += cost_beside(problem, u[k], gain, Q_ua + regularised @ gain)
         W = (W + W.mT) / 2
         nodes.append(W)
         gains.append(gain)
@@ -348,42 +388,3 @@ def _spread_and_maps(problem: Problem, noise: Noise, x: StatePath) -> tuple[Tens
         slope = jacobian(sigma.flatten(-2), z).unflatten(-2, sigma.shape[-2:])
     maps = torch.cat([sigma[..., None], slope.nan_to_num(0.0, 0.0, 0.0)], -1)
     return None, math.sqrt(dt) * maps.detach()
-
-
-def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:
-    """[[2c, pᵀ], [p, H]]: c + pᵀz + ½ zᵀHz as one matrix."""
-    first = torch.cat([2 * c[..., None], p], -1)
-    return torch.cat([first[..., None, :], torch.cat([p[..., None], H], -1)], -2)
-
-
-def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
-    """(k, K) from Q_ua = (Q_u, Q_ux): k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U; K = 0 for controls at a limit.
-
-    Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
-    """
-    if not problem.controls.limited:
-        return -solve(Q_uu, Q_ua)
-    Q_u, Q_ux = Q_ua[..., 0], Q_ua[..., 1:]
-    to = problem.controls.minimise(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
-    k = to - u
-    slope = Q_u + (Q_uu @ k[..., None])[..., 0]
-    further = problem.controls.project(to - slope.sign() * (1 + to.abs()))
-    share = ((further != to) | (slope == 0)).to(Q_uu)  # 1 for a free control, 0 for one at a limit
-    A = share[..., :, None] * Q_uu * share[..., None, :] + torch.diag_embed(1 - share)
-    return torch.cat([k[..., None], -torch.linalg.solve(A, share[..., None] * Q_ux)], -1)
-
-
-def _regularised(Q_uu: Tensor, floor: Tensor, damping: Tensor | None) -> Tensor:
-    """Q_uu with eigenvalues raised to at least a floor, plus damping; non-finite entries become zero."""
-    Q_uu, one = Q_uu.where(Q_uu.isfinite(), 0), torch.eye(Q_uu.shape[-1]).to(Q_uu)
-    least = floor.maximum(ROUNDING * Q_uu.diagonal(0, -2, -1).sum(-1))
-    if Q_uu.shape[-1] == 1:
-        regularised = Q_uu.maximum(floor[..., None, None])
-    elif is_positive_definite(Q_uu - one * least[..., None, None]).all():
-        regularised = Q_uu
-    else:
-        values, vectors = torch.linalg.eigh(Q_uu)
-        values = values.clamp_min(0).maximum(floor[..., None])
-        values = values.maximum(ROUNDING * values[..., -1:])
-        regularised = (vectors * values[..., None, :]) @ vectors.mT
-    return regularised if damping is None else regularised + one * damping[..., None, None]

@@ -53,9 +53,9 @@ def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
 def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
     """The control held for Δt that minimises ∫ℓ + V(F(x, u)), for V with gradient V_x at F(x, 0) and curvature H.
 
-    It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
-    −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with others u
-    also changes q within the step. With a target, u − u* replaces u, and f + gu* replaces f.
+    It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu + s(u) over U, with B = F_u/Δt: without limits and
+    s, −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with
+    others u also changes q within the step. With a target, u − u* replaces u in uᵀRu, and f + gu* replaces f.
 
     Args:
         free: the step with the control at rest.
@@ -63,8 +63,8 @@ def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Con
     B = free.by_control
     weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
-    if problem.controls.limited:
-        return problem.controls.minimise(weight / 2, about_control(weight / 2, b, free.u))
+    if not problem.has_linear_law:
+        return problem.best_control(weight / 2, about_control(weight / 2, b, free.u))
     u = -solve(weight, b[..., None])[..., 0]
     return u if free.u is None else u + free.u
 

@@ -35,7 +35,7 @@ class StepPrograms(StepDerivatives):
     """
 
     def __init__(self, problem: Problem, step_sizes: Sequence[float]):
-        super().__init__(problem.step, problem.system.n)
+        super().__init__(problem.smooth_step, problem.system.n)
         self.problem = problem
         self._search = _SearchStep(problem, step_sizes)
         self._first = _FunctionOfProblem(problem, super().first)

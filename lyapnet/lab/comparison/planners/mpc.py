@@ -49,6 +49,10 @@ class PredictiveControl(Planner):
             task = CasadiTask(self.problem)
         except OracleError as error:
             raise UsageError(f"{error} MPC cannot plan without.") from error
+        if not task.is_program_of_steps:
+            raise UsageError(
+                "Expected limits and uᵀRu alone for MPC, got another set or cost of controls; leave it out."
+            )
         n, m = task.step.size1_in(0), task.step.size1_in(1)
         self._solver, self._tail = _solver(task, steps, self._goal, self._rest), riccati(self.problem)
         if problem.follows_reference:  # the linearisation about one point of it says nothing of the others

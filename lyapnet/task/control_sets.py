@@ -1,0 +1,6 @@
+"""The control sets that a config may name; a ControlBox is chosen by controls.lower and controls.upper."""
+
+from lyapnet.task.ball import ControlBall
+from lyapnet.task.sets import ControlSet, Unbounded
+
+CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded, "ball": ControlBall}

@@ -4,7 +4,7 @@ import itertools
 import math
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 
 import torch
@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 DEGREES = {"linear": 1, "cubic": 3}
+COUNTS = (1, 2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter that are tried
+ALONG_AXIS = 8  # random values of a parameter at which they are tested, besides the ends of its range
+ASIDE = 0.71  # share of their ranges at which other parameters are meanwhile: in the middle much may vanish
 
 
 class Table(nn.Module):
@@ -92,6 +95,10 @@ class Basis(nn.Module, ABC):
         matrix = torch.stack(self(self.nodes()), -1)
         return torch.linalg.solve(matrix, values.flatten(1)).unflatten(-1, values.shape[1:])
 
+    @abstractmethod
+    def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
+        """The gradient of Σ c_k function_k in p."""
+
 
 class ChebyshevProducts(Basis):
     """Products of Chebyshev polynomials T_i(s₁)T_j(s₂)…, of parameters p (*batch, k) scaled to s ∈ [−1, 1].
@@ -114,11 +121,25 @@ class ChebyshevProducts(Basis):
         self.register_buffer("half_widths", torch.where(half > 0, half, 1.0), persistent=False)
 
     def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
-        axes = []
-        for k, count in enumerate(self.counts):
-            s = ((p[..., k] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
-            axes.append(_by_recurrence(s, torch.ones_like(s), s, count))
-        return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
+        return _products(self._along_axes(p))
+
+    def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
+        """The gradient of Σ c_k function_k in p, by T_i' = i U_{i−1}; beyond its range that at the end of it."""
+        axes, columns = self._along_axes(p), []
+        for k, (count, half) in enumerate(zip(self.counts, self.half_widths, strict=True)):
+            s = self._scaled(p, k)
+            second_kind = _by_recurrence(s, torch.ones_like(s), 2 * s, count)
+            slopes = [torch.zeros_like(s), *((i + 1) * U / half for i, U in enumerate(second_kind[: count - 1]))]
+            columns.append((c * torch.stack(_products([*axes[:k], slopes, *axes[k + 1 :]]), -1)).sum(-1))
+        return torch.stack(columns, -1)
+
+    def _scaled(self, p: Float[Tensor, "*batch k"], k: int) -> Float[Tensor, "*batch"]:
+        return ((p[..., k] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
+
+    def _along_axes(self, p: Float[Tensor, "*batch k"]) -> list[list[Tensor]]:
+        """The polynomials of each parameter."""
+        scaled = [self._scaled(p, k) for k in range(len(self.counts))]
+        return [_by_recurrence(s, torch.ones_like(s), s, n) for s, n in zip(scaled, self.counts, strict=True)]
 
     def nodes(self) -> Float[Tensor, "nodes k"]:
         angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.counts]
@@ -145,9 +166,92 @@ class FourierSeries(Basis):
         sines = _by_recurrence(cos, torch.zeros_like(sin), sin, self.highest + 1)
         return [*cosines, *sines[1:]]
 
+    def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
+        of_one, *others = self(p)
+        cosines, sines = others[: self.highest], others[self.highest :]
+        rate = 2 * math.pi / self.period
+        slopes = [torch.zeros_like(of_one), *(-(k + 1) * rate * y for k, y in enumerate(sines))]
+        slopes += [(k + 1) * rate * y for k, y in enumerate(cosines)]
+        return (c * torch.stack(slopes, -1)).sum(-1, keepdim=True)
+
     def nodes(self) -> Float[Tensor, "nodes k"]:
         count = 2 * self.highest + 1
         return (torch.arange(count, dtype=torch.float64) * (self.period / count))[:, None]
+
+
+class Interpolant(nn.Module):
+    """p (*batch, k) ↦ (*batch, *shape), the sum of functions of a basis through values at its nodes.
+
+    Args:
+        basis: functions of p.
+        values: (nodes, *shape).
+    """
+
+    coefficients: Float[Tensor, "nodes *shape"]
+
+    def __init__(self, basis: Basis, values: Float[Tensor, "nodes *shape"]):
+        super().__init__()
+        self.basis = basis
+        self.register_buffer("coefficients", basis.coefficients(values), persistent=False)
+
+    def forward(self, p: Float[Tensor, "*batch k"]) -> Tensor:
+        return combine(self.basis(p), self.coefficients)
+
+
+def combine(functions: Sequence[Float[Tensor, "*batch"]], coefficients: Float[Tensor, "nodes *shape"]) -> Tensor:
+    """Σ c_k function_k, (*batch, *shape)."""
+    return (torch.stack(list(functions), -1) @ coefficients.flatten(1)).unflatten(-1, coefficients.shape[1:])
+
+
+def fewest_products(
+    lower: Float[Tensor, " k"],
+    upper: Float[Tensor, " k"],
+    accurate: Callable[[ChebyshevProducts, Tensor], bool],
+    tested: Float[Tensor, "b k"],
+    most: int,
+) -> ChebyshevProducts | None:
+    """Products of the least degree that is accurate, along each parameter alone and then together.
+
+    Args:
+        accurate: products, and parameters between their nodes (b, k) ↦ whether they are accurate there.
+        tested: these parameters for all products together.
+        most: the largest number of products that is tried.
+
+    Returns:
+        The products; None if none that were tried are accurate.
+    """
+    widths = upper - lower
+    counts = [_count_along(axis, lower, upper, accurate) for axis in range(len(lower))]
+    for _ in COUNTS:
+        if math.prod(counts) >= most:
+            break
+        products = ChebyshevProducts(lower, upper, counts)
+        if accurate(products, tested):
+            return products
+        further = [next((more for more in COUNTS if more > count), most) for count in counts]
+        counts = [more if w > 0 else 1 for more, w in zip(further, widths.tolist(), strict=True)]
+    return None
+
+
+def _count_along(axis: int, lower: Tensor, upper: Tensor, accurate: Callable[[ChebyshevProducts, Tensor], bool]) -> int:
+    """The number of polynomials that are accurate along a parameter, with the others off the middle."""
+    width = float(upper[axis] - lower[axis])
+    if width == 0:
+        return 1
+    shares = torch.rand(ALONG_AXIS, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    tested = (lower + ASIDE * (upper - lower)).repeat(ALONG_AXIS + 2, 1)
+    tested[:, axis] = lower[axis] + width * torch.cat([shares, torch.tensor([0.0, 1.0])])
+    first, last = tested[-2], tested[-1]
+    for count in COUNTS:
+        counts = [count if k == axis else 1 for k in range(len(lower))]
+        if accurate(ChebyshevProducts(first, last, counts), tested):
+            return count
+    return COUNTS[-1]
+
+
+def _products(axes: Sequence[Sequence[Tensor]]) -> list[Tensor]:
+    """The products of one function of each axis."""
+    return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
 
 
 def _by_recurrence(s: Tensor, first: Tensor, second: Tensor, count: int) -> list[Tensor]:

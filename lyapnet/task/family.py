@@ -108,6 +108,10 @@ class Targets(nn.Module, ABC):
     def shift(self, p: Tensor) -> State:
         """x*(p) − x*(p̄), (*batch, n), of parameters (*batch, k)."""
 
+    @abstractmethod
+    def pull_back(self, p: Tensor, v: State) -> Tensor:
+        """The gradient of vᵀx*(p) in p, (*batch, k), for v (*batch, n)."""
+
     def rest(self, p: Tensor) -> Control | None:
         """u*(p), (*batch, m); None: the same for all members."""
         return None
@@ -131,6 +135,9 @@ class LinearTargets(Targets):
 
     def shift(self, p: Tensor) -> State:
         return (p - self.center) @ self.slope.mT
+
+    def pull_back(self, p: Tensor, v: State) -> Tensor:
+        return v @ self.slope
 
 
 class InterpolatedTargets(Targets):
@@ -161,6 +168,9 @@ class InterpolatedTargets(Targets):
 
     def shift(self, p: Tensor) -> State:
         return self._from_center(p)[..., : self.n]
+
+    def pull_back(self, p: Tensor, v: State) -> Tensor:
+        return self.basis.gradient(p, v @ self.coefficients[:, : self.n].mT)
 
     def rest(self, p: Tensor) -> Control:
         return self.rest_at_center + self._from_center(p)[..., self.n :]

@@ -61,6 +61,11 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
             "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got one or none of "
             "them; its V has no time, and points of D are what it is about."
         )
+    if cls is RegionCondition and problem.system.constants:
+        raise UsageError(
+            "Expected one system with the region program, got a family; the region is that of one member: leave family "
+            "out, or take program.name=lyapunov."
+        )
     if not weight:
         return None
     n, goal, initial_states = problem.system.n, problem.goal, problem.initial_states

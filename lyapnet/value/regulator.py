@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lyapnet.base.interpolation import ChebyshevProducts
+from lyapnet.base.interpolation import ChebyshevProducts, Interpolant, fewest_products
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, Matrix, PerState, State
 from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
 from lyapnet.value.expansions import in_float64
 
 DECAY_MARGIN = 1e-9  # smallest relative decay of each mode in a step
@@ -21,6 +22,10 @@ EQUILIBRIUM_TOLERANCE = 1e-6  # largest |ẋ| at the goal under the control at r
 NODES = 5  # Chebyshev nodes along each parameter of a family
 MOST_NODES = 200  # largest number of nodes of all parameters together
 INTERPOLATION_TOLERANCE = 1e-2  # largest error of an interpolated gain, relative to its largest entry
+ROOT_TOLERANCE = 1e-4  # largest error of an interpolated cost δᵀP(p)δ, relative to it in any direction δ
+ROOT_NODES = 400  # largest number of members through which it is interpolated
+TESTED_MEMBERS = 32  # random members at which it is checked, besides those at the ends of the ranges
+FLAT = 1e-9  # eigenvalues that are added to P(p), relative to the largest, so that its root is unique
 
 
 class Gains(NamedTuple):
@@ -158,7 +163,7 @@ def _fit(basis: ChebyshevProducts, exact: Problem, solve: _Solver) -> Gains:
             f"one member, or {solve.instead}."
         )
     between = exact.initial_states.sample(8, torch.Generator().manual_seed(0))[:, list(exact.system.constants)]
-    at_nodes, at_others = ([solve(_goal_of(exact, p)) for p in some] for some in (nodes, between))
+    at_nodes, at_others = ([solve(goal_of_member(exact, p)) for p in some] for some in (nodes, between))
     others = np.asarray(torch.stack(basis(between), -1))
     coefficients = []
     for known, expected in zip(zip(*at_nodes, strict=True), zip(*at_others, strict=True), strict=True):
@@ -173,7 +178,56 @@ def _fit(basis: ChebyshevProducts, exact: Problem, solve: _Solver) -> Gains:
     return Gains(*coefficients)
 
 
-def _goal_of(exact: Problem, p: Float[Tensor, " k"]) -> State:
+def root_of_members(problem: Problem, purpose: str, instead: str) -> Interpolant:
+    """p ↦ L(p) (n, n), lower triangular, with δᵀP(p)δ = ‖L(p)ᵀδ‖² the cost to go of each member's regulator.
+
+    n is the number of states that are no parameters. L interpolates the Cholesky factors of members by polynomials of
+    the least degree that leaves an error of ROOT_TOLERANCE, in all directions δ: (1 − ε)P ≤ LLᵀ ≤ (1 + ε)P at members
+    between. LLᵀ is nowhere indefinite. Rows of zeros are of states that cost nothing.
+
+    Raises:
+        ValueError: a member has no regulator, or no such polynomials fit.
+    """
+    exact = in_float64(problem)
+    solve, constants = _Solver(exact, purpose, instead, spread=False), list(exact.system.constants)
+    n, box = exact.system.n - len(constants), exact.initial_states
+    ranges = Box(box.lower[constants], box.upper[constants])
+    solutions = dict[tuple[float, ...], Tensor]()
+
+    def P_of(p: Tensor) -> Matrix:
+        key = tuple(p.tolist())
+        if key not in solutions:
+            solutions[key] = torch.as_tensor(solve(goal_of_member(exact, p)).P)[:n, :n]
+        return solutions[key]
+
+    tested = torch.cat([ranges.corners(), ranges.sample(TESTED_MEMBERS, torch.Generator().manual_seed(0))])
+    costs = torch.stack([P_of(p) for p in tested]).any(0).any(-1)
+
+    def factor(p: Tensor) -> Matrix:
+        P = P_of(p)[costs][:, costs]
+        return torch.linalg.cholesky(P + FLAT * torch.linalg.eigvalsh(P)[-1] * torch.eye(len(P)).to(P))
+
+    def through(basis: ChebyshevProducts) -> Interpolant:
+        places = torch.eye(n, dtype=torch.float64)[costs]
+        return Interpolant(basis, torch.stack([places.mT @ factor(p) @ places for p in basis.nodes()]))
+
+    def is_accurate(basis: ChebyshevProducts, between: Tensor) -> bool:
+        found = through(basis)(between)[:, costs][:, :, costs]
+        share = torch.linalg.solve_triangular(torch.stack([factor(p) for p in between]), found, upper=False)
+        error = torch.linalg.matrix_norm(share @ share.mT - torch.eye(share.shape[-1]).to(share), 2)
+        return bool((error <= ROOT_TOLERANCE).all())
+
+    basis = fewest_products(ranges.lower, ranges.upper, is_accurate, tested, ROOT_NODES)
+    if basis is None:
+        raise ValueError(
+            f"Expected a family whose regulators are smooth in its parameters for {purpose}, got some that polynomials "
+            f"through {ROOT_NODES} members miss by more than {ROOT_TOLERANCE:.0e}; narrow the family, take one member, "
+            f"or {instead}."
+        )
+    return through(basis)
+
+
+def goal_of_member(exact: Problem, p: Float[Tensor, " k"]) -> State:
     """(x*(p), p), the goal of a family's member with parameters p, where from_goal vanishes."""
     constants = list(exact.system.constants)
     state = exact.goal.clone()

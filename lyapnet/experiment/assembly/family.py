@@ -48,6 +48,11 @@ def family_of(
     for name in weights:
         if not ranges[name][0] > 0:
             raise UsageError(f"Expected family.{name} > 0, got {ranges[name]}; V is a function of its logarithm.")
+        if config.horizon.stationary and weights[name].matrix == "Q_T":
+            raise UsageError(
+                f"Expected no weight of Q_T in a family with horizon.stationary, got {name}; φ is the regulator's: "
+                "remove it."
+            )
     moved = _moved_states(ranges, system)
     units = [""] * len(ranges)
     for i, k in moved.items():

@@ -1,5 +1,6 @@
 """Builds V, its closed loop and the program of a config."""
 
+import copy
 import inspect
 from typing import Any
 
@@ -11,8 +12,8 @@ from lyapnet.experiment.assembly.entries import entry_per_state
 from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import Program
 from lyapnet.loop.rollout import Rollout
-from lyapnet.task.cost import Cost
-from lyapnet.task.family import FamilySystem
+from lyapnet.task.cost import Cost, MadeOfAnother, RegulatorsTail
+from lyapnet.task.family import FamilySystem, family_cost_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
@@ -20,6 +21,7 @@ from lyapnet.value.networks import (
     CentredNetwork,
     ExpansionNetwork,
     IgnoringStates,
+    Members,
     Scaling,
     StationaryNetwork,
     TerminalAnchor,
@@ -58,6 +60,8 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         chosen["constants"] = [kept.index(i) for i in problem.system.constants if i in kept]
     if "weights" in accepted and isinstance(problem.system, FamilySystem):
         chosen["weights"] = [kept.index(i) for i in problem.system.logarithms]
+    if "members" in accepted and isinstance(problem.system, FamilySystem):
+        chosen["members"] = _members(problem, kept)
     if "borders" in accepted and domain is not None:
         places = {problem.system.state_names[i]: place for place, i in enumerate(kept)}
         chosen["borders"] = [(places[each.state], each) for each in domain.borders if each.state in places]
@@ -86,6 +90,26 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
             V = WithPenalty(V, problem.constraints, problem.constraints.margin, problem.horizon.dt)
     V.made_for = POLICIES[config.rollout.policy]
     return V.to(DTYPES[config.training.precision])
+
+
+def _members(problem: Problem, kept: list[int]) -> Members:
+    """The goals and regulators of the members of a stationary family, in the states on which V depends.
+
+    Raises:
+        UsageError: V does not depend on a parameter, or on a state that costs something.
+    """
+    cost, system = problem.cost, problem.system
+    while not isinstance(cost, RegulatorsTail):
+        assert isinstance(cost, MadeOfAnother)
+        cost = cost.cost
+    n = cost.n
+    needed = [i for i in range(system.n) if i >= n or bool(cost.root.coefficients[:, i].any())]
+    if unseen := [system.state_names[i] for i in needed if i not in kept]:
+        raise UsageError(
+            f"Expected V to depend on the parameters of a stationary family and on states that cost something, got "
+            f"{unseen[0]} in network.ignored_states; leave it out there."
+        )
+    return Members(*copy.deepcopy((family_cost_of(cost).targets, cost.root)), kept[: len(kept) - system.n + n])
 
 
 def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str) -> None:

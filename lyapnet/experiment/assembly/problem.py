@@ -104,7 +104,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         problem = in_domain(config.domain, problem)
         if problem.constraints is not None and config.constraints.margin is None and config.network.penalty:
             problem.constraints.margin = choose_margins(problem, problem.constraints)
-        if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
+        if horizon.stationary and (config.family or not isinstance(parts.cost, RegulatorTail)):
             problem = without_end(problem)
         return problem.to(dtype)
 
@@ -139,8 +139,6 @@ def _cost_section(config: Config) -> CostConfig:
     """The cost section; for a stationary V, which needs no Q_T, with Q_T = Q until φ is computed."""
     if not config.horizon.stationary:
         return config.cost
-    if config.family:
-        raise UsageError("Expected one system with horizon.stationary, got a family; train one V for each member.")
     if config.cost.Q_T is not None:
         raise UsageError("Expected no cost.Q_T with horizon.stationary, got one; φ is the regulator's: remove it.")
     return replace(config.cost, Q_T=config.cost.Q)

@@ -1,6 +1,5 @@
 """The targets of a family's members: x*(p) and u*(p), with states that are not given solved for."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
-from lyapnet.base.interpolation import ChebyshevProducts
+from lyapnet.base.interpolation import ChebyshevProducts, fewest_products
 from lyapnet.experiment.assembly.target import (
     CONTROL_ADVICE,
     about_written_target,
@@ -27,8 +26,6 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 
 TESTED = 8  # random members whose targets are checked, besides those at the ends of the ranges
-COUNTS = (1, 2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter; the first is taken that is accurate
-ASIDE = 0.71  # share of their ranges at which other parameters are meanwhile: in the middle much may vanish
 MOST_MEMBERS = 400  # largest number of members whose targets are interpolated
 CHOOSE_ANOTHER = f"choose another, or {CONTROL_ADVICE}"
 ACCURATE = 1e-8  # largest rate at an interpolated target, in units of the rates on X₀
@@ -175,33 +172,13 @@ class TargetsOfMembers:
         Raises:
             UsageError: they would need too many members.
         """
-        counts = [self._count_along(axis, ranges) for axis in range(ranges.dimension)]
-        for _ in COUNTS:
-            if math.prod(counts) >= MOST_MEMBERS:
-                break
-            targets = self._through(ChebyshevProducts(ranges.lower, ranges.upper, counts))
-            if self._is_accurate(targets, tested):
-                return targets
-            further = [next((more for more in COUNTS if more > count), MOST_MEMBERS) for count in counts]
-            counts = [more if w > 0 else 1 for more, w in zip(further, ranges.widths.tolist(), strict=True)]
+        basis = fewest_products(ranges.lower, ranges.upper, self._is_accurate, tested, MOST_MEMBERS)
+        if basis is not None:
+            return self._through(basis)
         raise UsageError(
             f"Expected targets that are smooth in {', '.join(self.family.names)}, got some that polynomials through "
             f"{MOST_MEMBERS} members miss; narrow the family, or write target_control."
         )
-
-    def _count_along(self, axis: int, ranges: Box) -> int:
-        """The number of polynomials that are accurate along a parameter, with the others off the middle."""
-        if ranges.widths[axis] == 0:
-            return 1
-        aside = ranges.lower + ASIDE * ranges.widths
-        line = Box(*(_with_entry(aside, axis, float(side[axis])) for side in (ranges.lower, ranges.upper)))
-        tested = torch.cat([line.corners(), line.sample(TESTED, torch.Generator().manual_seed(0))])
-        for count in COUNTS:
-            counts = [count if k == axis else 1 for k in range(ranges.dimension)]
-            targets = self._through(ChebyshevProducts(line.lower, line.upper, counts))
-            if self._is_accurate(targets, tested):
-                return count
-        return COUNTS[-1]
 
     def _through(self, basis: ChebyshevProducts) -> InterpolatedTargets:
         nodes = basis.nodes()
@@ -211,9 +188,9 @@ class TargetsOfMembers:
         middle = self.point(self.center)
         return InterpolatedTargets(basis, points, torch.cat([middle.x, middle.u]), len(middle.x), self.solved)
 
-    def _is_accurate(self, targets: InterpolatedTargets, tested: Tensor) -> bool:
+    def _is_accurate(self, basis: ChebyshevProducts, tested: Tensor) -> bool:
         """Whether the interpolated targets are those that are given, and the interpolated controls hold them."""
-        middle = self.point(self.center)
+        targets, middle = self._through(basis), self.point(self.center)
         for p in tested:
             search, x = self._search(p), middle.x + targets.shift(p)
             missed = [abs(float(x[i]) - value) > ACCURATE * (1 + abs(value)) for i, value in self.given(p).items()]
@@ -229,9 +206,3 @@ class TargetsOfMembers:
 
 def _state(entries: Mapping[int, float]) -> Tensor:
     return torch.tensor([entries[i] for i in sorted(entries)], dtype=torch.float64)
-
-
-def _with_entry(p: Tensor, axis: int, value: float) -> Tensor:
-    changed = p.clone()
-    changed[axis] = value
-    return changed

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lyapnet.base.interpolation import Interpolant
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import ControlMatrix, PerState, State
 from lyapnet.task.cost.base import BUFFERS, Cost, quadratic_form
@@ -168,11 +169,11 @@ class RegulatorTail(MadeOfAnother):
     """
 
     P: Float[Tensor, "n n"]
+    words: str = "with what a regulator goes on to pay as φ"
 
     def __init__(self, cost: Cost, P: Tensor):
         super().__init__(cost)
         self.register_buffer("P", P, persistent=False)
-        self.words: str = "with what a regulator goes on to pay as φ"
 
     def terminal(self, x: State) -> PerState:
         return quadratic_form(self.P, self.from_goal(x))
@@ -185,6 +186,31 @@ class RegulatorTail(MadeOfAnother):
 
     def ignores_at_end(self, i: int, n: int) -> bool:
         return not any(self.P[i])
+
+
+class RegulatorsTail(MadeOfAnother):
+    """The same for each member of a family: φ(x, p) = ‖L(p)ᵀ(x − x*(p))‖², so that P(p) = L(p)L(p)ᵀ ≥ 0 for any L.
+
+    Args:
+        cost: q and R, functions of (x, p).
+        root: p (*batch, k) ↦ L(p) (*batch, n, n), an Interpolant with rows of zeros for states that cost nothing.
+        n: number of states x.
+    """
+
+    words: str = RegulatorTail.words
+
+    def __init__(self, cost: Cost, root: Interpolant, n: int):
+        super().__init__(cost)
+        self.root, self.n = root, n
+
+    def terminal(self, x: State) -> PerState:
+        return apply(self.root(x[..., self.n :]).mT, self.from_goal(x)[..., : self.n]).square().sum(-1)
+
+    def ignores(self, i: int, n: int) -> bool:
+        return self.ignores_at_end(i, n) and self.cost.ignores(i, n)
+
+    def ignores_at_end(self, i: int, n: int) -> bool:
+        return not bool(self.root.coefficients[:, i].any()) if i < self.n else Cost.ignores_at_end(self, i, n)
 
 
 class ObstacleCost(MadeOfAnother):

@@ -12,7 +12,7 @@ from lyapnet.value.networks.fcn import FCN
 from lyapnet.value.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.value.networks.ignoring import IgnoringStates, kept_states
 from lyapnet.value.networks.quadratic import QuadraticForm
-from lyapnet.value.networks.stationary import StationaryNetwork, Timeless
+from lyapnet.value.networks.stationary import Members, StationaryNetwork, Timeless
 from lyapnet.value.networks.with_penalty import WithPenalty, learned_part
 
 NETWORKS: dict[str, type[ValueFunction]] = {
@@ -34,6 +34,7 @@ __all__ = [
     "ExpansionNetwork",
     "GoalAnchor",
     "IgnoringStates",
+    "Members",
     "PartiallyConvexNetwork",
     "QuadraticForm",
     "Scaling",

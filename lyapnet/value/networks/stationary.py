@@ -6,11 +6,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lyapnet.base.interpolation import ChebyshevProducts, Interpolant, combine
+from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import PerState, State, Time
+from lyapnet.task.family import Targets
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks.base import Scaling
 from lyapnet.value.networks.expansion import standard_widths
 from lyapnet.value.networks.fcn import FCN
+
+FLAT = 1e-9  # curvature relative to the largest that a direction without any gets, so that V > 0
 
 
 class StationaryNetwork(ValueFunction):
@@ -22,15 +27,19 @@ class StationaryNetwork(ValueFunction):
     which the regulator is accurate; it may be much smaller than V on X₀. To resolve both scales the inputs of N are
     compressed, η_i = ξ_i / (1 + ξ_i²)^¼; (sin θ, cos θ) of chosen angles are further inputs.
 
+    In a family, x = (y, p), that is so for each member: ξ = C(p)ᵀ(y − y*(p)) with s C(p)C(p)ᵀ = P(p), and p, scaled to
+    its range, is a further input of N. C is a polynomial in p.
+
     Args:
         scaling: magnitudes of the task, for a network without regulator.
         hidden, activation: layers of the FCN N; None: two layers of 64, or of 128 for five states and more.
         embedded_angles: indices of the states whose sine and cosine are further inputs of N.
+        members: y*(p) and P(p) of a family, whose parameters p are the last states; None: no family.
     """
 
-    goal: Float[Tensor, " n"]
+    goal: Float[Tensor, " n"]  # in a family (y*(p), p) of the member in the middle
     scale: Float[Tensor, ""]  # s, in units of cost
-    coordinates: Float[Tensor, "n n"]  # C
+    coordinates: Float[Tensor, "*nodes n n"]  # C; in a family the coefficients of C(p)
     angles: Int[Tensor, " k"]
 
     def __init__(
@@ -39,16 +48,22 @@ class StationaryNetwork(ValueFunction):
         hidden: Sequence[int] | None = None,
         activation: str = "tanh",
         embedded_angles: Sequence[int] = (),
+        members: "Members | None" = None,
     ):
         super().__init__()
-        n = self.n = len(scaling.state)
+        n = len(scaling.state)
+        self.members, self.constants = members, 0 if members is None else members.constants
+        self.n = n - self.constants
         inputs = Scaling([1.0] * (n + 2 * len(embedded_angles)), 1.0, 1.0)
         self.network = FCN(inputs, standard_widths(n) if hidden is None else hidden, activation)
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)
         self.register_buffer("goal", torch.zeros(n))
         self.register_buffer("scale", torch.tensor(scaling.value))
-        self.register_buffer("coordinates", torch.diag(1 / torch.tensor(scaling.state)))
+        coordinates = torch.diag(1 / torch.tensor(scaling.state[: self.n]))
+        if members is not None:  # the first function of the basis is 1
+            coordinates = torch.stack([coordinates, *[0 * coordinates] * (len(members.root.coefficients) - 1)])
+        self.register_buffer("coordinates", coordinates)
         self.register_buffer("angles", torch.tensor(embedded_angles, dtype=torch.long), persistent=False)
 
     def forward(self, t: Time, x: State) -> PerState:
@@ -64,53 +79,126 @@ class StationaryNetwork(ValueFunction):
         along = 2 * (self.scale / root + known * N / root**4)[..., None] * xi
         xi_2 = 1 + xi**2
         along = along + (known * share)[..., None] * slope[..., : self.n] * (1 + xi_2) / (2 * xi_2 * xi_2.sqrt().sqrt())
-        return known * bend, bend[..., None] * (
-            along @ self.coordinates.mT + self._angle_gradient(x, known * share, slope)
-        )
+        gradient = self._pull_back(x, along, (known * share)[..., None] * slope[..., self.n : self.n + self.constants])
+        return known * bend, bend[..., None] * (gradient + self._angle_gradient(x, known * share, slope))
 
     def curvature(self, t: Time) -> Tensor:
-        """H = 2s CCᵀ, the curvature of the regulator's value."""
-        return 2 * self.scale * (self.coordinates @ self.coordinates.mT).expand(*t.shape, -1, -1)
+        """H = 2s CCᵀ, the curvature of the regulator's value; in a family that of the member in the middle."""
+        return self.curvature_at(t, self.goal.expand(*t.shape, -1))
 
-    def _around(self, x: State) -> tuple[State, PerState, PerState]:
+    def curvature_at(self, t: Time, x: State) -> Tensor:
+        C, k = self._coordinates_at(x), self.constants
+        H = 2 * self.scale * (C @ C.mT).expand(*x.shape[:-1], -1, -1)
+        return H if self.members is None else nn.functional.pad(H, (0, k, 0, k))
+
+    def _coordinates_at(self, x: State) -> Tensor:
+        """C, of a family C(p) (*batch, n, n)."""
+        if self.members is None:
+            return self.coordinates
+        return combine(self.members.basis(x[..., self.n :]), self.coordinates)
+
+    def _from_goal(self, x: State) -> Tensor:
+        """x − x*, of a family y − y*(p)."""
+        if self.members is None:
+            return x - self.goal
+        return x[..., : self.n] - self.goal[: self.n] - self.members.shift(x[..., self.n :])
+
+    def _around(self, x: State) -> tuple[Tensor, PerState, PerState]:
         """ξ, √(1 + w) and ρ."""
-        xi = (x - self.goal) @ self.coordinates
+        delta, C = self._from_goal(x), self._coordinates_at(x)
+        xi = delta @ C if self.members is None else apply(C.mT, delta)
         w = (xi**2).sum(-1)
         return xi, torch.sqrt(1 + w), w / (1 + w)
 
-    def _regulator(self, xi: State, root: PerState) -> PerState:
+    def _regulator(self, xi: Tensor, root: PerState) -> PerState:
         """s h(w), computed as 2sw/(√(1 + w) + 1) to avoid cancellation near the goal."""
         return 2 * self.scale * (xi**2).sum(-1) / (root + 1)
 
-    def _inputs(self, x: State, xi: State) -> Tensor:
-        """The inputs of N: η, and the sines and cosines."""
-        eta = xi / (1 + xi**2).sqrt().sqrt()
-        if not len(self.angles):
-            return eta
-        theta = x[..., self.angles]
-        return torch.cat([eta, torch.sin(theta), torch.cos(theta)], -1)
+    def _inputs(self, x: State, xi: Tensor) -> Tensor:
+        """The inputs of N: η, the scaled parameters of a family, and the sines and cosines."""
+        inputs = [xi / (1 + xi**2).sqrt().sqrt()]
+        if self.members is not None:
+            basis = self.members.basis
+            inputs.append((x[..., self.n :] - basis.center) / basis.half_widths)
+        if len(self.angles):
+            theta = x[..., self.angles]
+            inputs += [torch.sin(theta), torch.cos(theta)]
+        return torch.cat(inputs, -1) if len(inputs) > 1 else inputs[0]
+
+    def _pull_back(self, x: State, along: Tensor, beside: Tensor) -> State:
+        """The gradient in x of a function with gradients `along` in ξ and `beside` in the scaled parameters."""
+        C = self._coordinates_at(x)
+        if self.members is None:
+            return along @ C.mT
+        p, gradient = x[..., self.n :], apply(C, along)
+        pairs = self._from_goal(x)[..., :, None] * along[..., None, :]
+        by_C = self.members.basis.gradient(p, pairs.flatten(-2) @ self.coordinates.flatten(1).mT)
+        by_p = by_C - self.members.pull_back(p, gradient) + beside / self.members.basis.half_widths
+        return torch.cat([gradient, by_p], -1)
 
     def _angle_gradient(self, x: State, weight: PerState, slope: Tensor) -> State | float:
         """The contribution of the sines and cosines to V_x."""
         if not len(self.angles):
             return 0.0
-        theta, (sine, cosine) = x[..., self.angles], slope[..., self.n :].chunk(2, -1)
+        theta, (sine, cosine) = x[..., self.angles], slope[..., self.n + self.constants :].chunk(2, -1)
         turning = weight[..., None] * (sine * theta.cos() - cosine * theta.sin())
         return torch.zeros_like(x).index_add(-1, self.angles, turning)
 
     @torch.no_grad()
     def start_from_regulator(self, goal: State, hessian: Tensor, scale: float) -> None:
-        """Initialise from the regulator's value ½ δᵀHδ at the goal.
+        """Initialise from the regulator's value ½ δᵀHδ at the goal, or from those of the members of a family.
 
         Args:
-            hessian: H (n, n), symmetric positive semidefinite.
+            hessian: H (n, n), symmetric positive semidefinite; not read for a family.
             scale: s, the value up to which the regulator is used.
         """
-        values, vectors = torch.linalg.eigh(hessian / 2)
-        values = values.clamp_min(1e-9 * float(values.max()))
+        half = hessian / 2
+        if self.members is not None:
+            roots = self.members.definite_roots()
+            in_middle = combine(self.members.basis(goal[self.n :]), roots)
+            half = in_middle @ in_middle.mT
+        values, vectors = torch.linalg.eigh(half)
+        values = values.clamp_min(FLAT * float(values.max()))
+        C = vectors * (values / scale).sqrt()
+        if self.members is not None:  # the same coordinates ξ in the middle of the family as for that system alone
+            C = roots @ torch.linalg.solve(in_middle, C)
         self.goal.copy_(goal)
         self.scale.fill_(scale)
-        self.coordinates.copy_(vectors * (values / scale).sqrt())
+        self.coordinates.copy_(C)
+
+
+class Members(nn.Module):
+    """The members of a stationary family: y*(p), and L(p) with the regulator's cost ‖L(p)ᵀ(y − y*(p))‖².
+
+    Args:
+        targets: p ↦ x*(p).
+        root: p ↦ L(p) in all states x.
+        kept: the indices of the states y among x on which V depends.
+    """
+
+    places: Float[Tensor, "n states"]  # rows of the identity
+
+    def __init__(self, targets: Targets, root: Interpolant, kept: Sequence[int]):
+        super().__init__()
+        assert isinstance(root.basis, ChebyshevProducts)
+        self.targets, self.root, self.basis = targets, root, root.basis
+        self.constants: int = len(root.basis.counts)
+        self.register_buffer("places", torch.eye(root.coefficients.shape[-1])[list(kept)], persistent=False)
+
+    def shift(self, p: Tensor) -> State:
+        """y*(p) − y*(p̄)."""
+        return self.targets.shift(p) @ self.places.mT
+
+    def pull_back(self, p: Tensor, v: State) -> Tensor:
+        """The gradient of vᵀy*(p) in p."""
+        return self.targets.pull_back(p, v @ self.places)
+
+    def definite_roots(self) -> Tensor:
+        """The coefficients of L(p) in y, with a small weight on states that cost nothing."""
+        roots = self.places @ self.root.coefficients @ self.places.mT
+        costs = roots.abs().amax((0, -1))
+        roots[0] += torch.diag(torch.where(costs > 0, 0.0, FLAT**0.5 * costs.max()))
+        return roots
 
 
 class Timeless(ValueFunction):

@@ -197,7 +197,7 @@ def test_states_that_cost_nothing_are_flat():
     V = build_value_function(config_of(cartpole), problem)
     z = problem.initial_states.sample(5)
     assert_close(V(NOW, z), V(NOW, z + torch.tensor([3.0, 0, 0, 0, 0])))
-    with pytest.raises(UsageError, match="got length in network.ignored_states; leave it out"):
+    with pytest.raises(UsageError, match=r"got length in network\.ignored_states; leave it out"):
         build_value_function(config_of(cartpole, "network.ignored_states=[length]"), problem)
 
 
@@ -237,7 +237,7 @@ class Loaded(Mass):
 def test_constants_that_no_family_names_are_refused(family):
     loaded = {"system": {"name": f"{__name__}:Loaded"}, "cost": {"Q": [1, 0.1, 0], "R": 0.1}, "family": family}
     box = {"initial_states": {"lower": [-1, -1, -1], "upper": [1, 1, 1]}}
-    with pytest.raises(UsageError, match="constant states that are parameters of a family for .*, got load"):
+    with pytest.raises(UsageError, match=r"constant states that are parameters of a family for .*, got load"):
         problem_of({**MASS, **loaded, **box})
 
 

@@ -87,9 +87,10 @@ class StationaryNetwork(ValueFunction):
         return self.curvature_at(t, self.goal.expand(*t.shape, -1))
 
     def curvature_at(self, t: Time, x: State) -> Tensor:
-        C, k = self._coordinates_at(x), self.constants
-        H = 2 * self.scale * (C @ C.mT).expand(*x.shape[:-1], -1, -1)
-        return H if self.members is None else nn.functional.pad(H, (0, k, 0, k))
+        if self.members is None:
+            return 2 * self.scale * (self.coordinates @ self.coordinates.mT).expand(*x.shape[:-1], -1, -1)
+        C = torch.eye(len(self.goal), self.n).to(x) @ self._coordinates_at(x)  # zeros for the parameters
+        return 2 * self.scale * C @ C.mT
 
     def _coordinates_at(self, x: State) -> Tensor:
         """C, of a family C(p) (*batch, n, n)."""

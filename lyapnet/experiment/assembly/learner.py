@@ -109,7 +109,8 @@ def _members(problem: Problem, kept: list[int]) -> Members:
             f"Expected V to depend on the parameters of a stationary family and on states that cost something, got "
             f"{unseen[0]} in network.ignored_states; leave it out there."
         )
-    return Members(*copy.deepcopy((family_cost_of(cost).targets, cost.root)), kept[: len(kept) - system.n + n])
+    targets, root = copy.deepcopy((family_cost_of(cost).targets, cost.root))
+    return Members(targets.double(), problem.goal[:n].double(), root.double(), kept[: len(kept) - system.n + n])
 
 
 def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str) -> None:

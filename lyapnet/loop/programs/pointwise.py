@@ -110,6 +110,8 @@ class PointwiseCondition:
         x = self.region.sample(CANDIDATES_PER_POINT * self.points, generator).to(goal)
         share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64).to(x.device)
         nearer = NEAREST_SHARE**near if self.stationary else near
+        if self.stationary and self.problem.system.constants:  # those of the members
+            goal = x - self.problem.cost.from_goal(x)
         x = goal + (x - goal) * torch.where(late < 0.5, 1.0, nearer)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)
         return self.duration * (1 - before_end), x

@@ -27,8 +27,8 @@ class StationaryNetwork(ValueFunction):
     which the regulator is accurate; it may be much smaller than V on X₀. To resolve both scales the inputs of N are
     compressed, η_i = ξ_i / (1 + ξ_i²)^¼; (sin θ, cos θ) of chosen angles are further inputs.
 
-    In a family, x = (y, p), that is so for each member: ξ = C(p)ᵀ(y − y*(p)) with s C(p)C(p)ᵀ = P(p), and p, scaled to
-    its range, is a further input of N. C is a polynomial in p.
+    In a family, x = (y, p), that is so for each member: ξ = GᵀL(p)ᵀ(y − y*(p)) with P(p) = L(p)L(p)ᵀ and s GGᵀ = 1, and
+    p, scaled to its range, is a further input of N. y* and L are those of the problem; checkpoints have G alone.
 
     Args:
         scaling: magnitudes of the task, for a network without regulator.
@@ -37,9 +37,9 @@ class StationaryNetwork(ValueFunction):
         members: y*(p) and P(p) of a family, whose parameters p are the last states; None: no family.
     """
 
-    goal: Float[Tensor, " n"]  # in a family (y*(p), p) of the member in the middle
+    goal: Float[Tensor, " n"]
     scale: Float[Tensor, ""]  # s, in units of cost
-    coordinates: Float[Tensor, "*nodes n n"]  # C; in a family the coefficients of C(p)
+    coordinates: Float[Tensor, "n n"]  # C, or G of a family
     angles: Int[Tensor, " k"]
 
     def __init__(
@@ -58,12 +58,10 @@ class StationaryNetwork(ValueFunction):
         self.network = FCN(inputs, standard_widths(n) if hidden is None else hidden, activation)
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)
-        self.register_buffer("goal", torch.zeros(n))
+        self.register_buffer("goal", torch.zeros(n), persistent=members is None)
         self.register_buffer("scale", torch.tensor(scaling.value))
-        coordinates = torch.diag(1 / torch.tensor(scaling.state[: self.n]))
-        if members is not None:  # the first function of the basis is 1
-            coordinates = torch.stack([coordinates, *[0 * coordinates] * (len(members.root.coefficients) - 1)])
-        self.register_buffer("coordinates", coordinates)
+        C = torch.diag(1 / torch.tensor(scaling.state[: self.n]))
+        self.register_buffer("coordinates", C if members is None else members.relative(C))
         self.register_buffer("angles", torch.tensor(embedded_angles, dtype=torch.long), persistent=False)
 
     def forward(self, t: Time, x: State) -> PerState:
@@ -84,25 +82,24 @@ class StationaryNetwork(ValueFunction):
 
     def curvature(self, t: Time) -> Tensor:
         """H = 2s CCᵀ, the curvature of the regulator's value; in a family that of the member in the middle."""
-        return self.curvature_at(t, self.goal.expand(*t.shape, -1))
+        x = self.goal if self.members is None else nn.functional.pad(self.members.basis.center, (self.n, 0))
+        return self.curvature_at(t, x.expand(*t.shape, -1))
 
     def curvature_at(self, t: Time, x: State) -> Tensor:
         if self.members is None:
             return 2 * self.scale * (self.coordinates @ self.coordinates.mT).expand(*x.shape[:-1], -1, -1)
-        C = torch.eye(len(self.goal), self.n).to(x) @ self._coordinates_at(x)  # zeros for the parameters
+        C = torch.eye(x.shape[-1], self.n).to(x) @ self._coordinates_at(x)  # zeros for the parameters
         return 2 * self.scale * C @ C.mT
 
     def _coordinates_at(self, x: State) -> Tensor:
         """C, of a family C(p) (*batch, n, n)."""
         if self.members is None:
             return self.coordinates
-        return combine(self.members.basis(x[..., self.n :]), self.coordinates)
+        return combine(self.members.basis(x[..., self.n :]), self.members.roots @ self.coordinates)
 
     def _from_goal(self, x: State) -> Tensor:
         """x − x*, of a family y − y*(p)."""
-        if self.members is None:
-            return x - self.goal
-        return x[..., : self.n] - self.goal[: self.n] - self.members.shift(x[..., self.n :])
+        return x - self.goal if self.members is None else x[..., : self.n] - self.members.goal(x[..., self.n :])
 
     def _around(self, x: State) -> tuple[Tensor, PerState, PerState]:
         """ξ, √(1 + w) and ρ."""
@@ -133,7 +130,7 @@ class StationaryNetwork(ValueFunction):
             return along @ C.mT
         p, gradient = x[..., self.n :], apply(C, along)
         pairs = self._from_goal(x)[..., :, None] * along[..., None, :]
-        by_C = self.members.basis.gradient(p, pairs.flatten(-2) @ self.coordinates.flatten(1).mT)
+        by_C = self.members.basis.gradient(p, pairs.flatten(-2) @ (self.members.roots @ self.coordinates).flatten(1).mT)
         by_p = by_C - self.members.pull_back(p, gradient) + beside / self.members.basis.half_widths
         return torch.cat([gradient, by_p], -1)
 
@@ -150,56 +147,59 @@ class StationaryNetwork(ValueFunction):
         """Initialise from the regulator's value ½ δᵀHδ at the goal, or from those of the members of a family.
 
         Args:
-            hessian: H (n, n), symmetric positive semidefinite; not read for a family.
+            hessian: H (n, n), symmetric positive semidefinite; not read for a family, as `goal` is not.
             scale: s, the value up to which the regulator is used.
         """
-        half = hessian / 2
-        if self.members is not None:
-            roots = self.members.definite_roots()
-            in_middle = combine(self.members.basis(goal[self.n :]), roots)
-            half = in_middle @ in_middle.mT
-        values, vectors = torch.linalg.eigh(half)
-        values = values.clamp_min(FLAT * float(values.max()))
-        C = vectors * (values / scale).sqrt()
-        if self.members is not None:  # the same coordinates ξ in the middle of the family as for that system alone
-            C = roots @ torch.linalg.solve(in_middle, C)
+        values, vectors = torch.linalg.eigh(hessian / 2 if self.members is None else self.members.middle_cost())
+        C = vectors * (values.clamp_min(FLAT * float(values.max())) / scale).sqrt()
         self.goal.copy_(goal)
         self.scale.fill_(scale)
-        self.coordinates.copy_(C)
+        # of a family ξ is in the middle what it is for that system alone
+        self.coordinates.copy_(C if self.members is None else self.members.relative(C))
 
 
 class Members(nn.Module):
     """The members of a stationary family: y*(p), and L(p) with the regulator's cost ‖L(p)ᵀ(y − y*(p))‖².
 
     Args:
-        targets: p ↦ x*(p).
-        root: p ↦ L(p) in all states x.
+        targets: p ↦ x*(p) − x*(p̄).
+        middle: x*(p̄).
+        root: p ↦ L(p) in all states x, lower triangular.
         kept: the indices of the states y among x on which V depends.
     """
 
     places: Float[Tensor, "n states"]  # rows of the identity
+    middle: Float[Tensor, " states"]
+    roots: Float[Tensor, "nodes n n"]  # coefficients of L(p), with a small weight on states that cost nothing
 
-    def __init__(self, targets: Targets, root: Interpolant, kept: Sequence[int]):
+    def __init__(self, targets: Targets, middle: Tensor, root: Interpolant, kept: Sequence[int]):
         super().__init__()
         assert isinstance(root.basis, ChebyshevProducts)
-        self.targets, self.root, self.basis = targets, root, root.basis
+        self.targets, self.basis = targets, root.basis
         self.constants: int = len(root.basis.counts)
-        self.register_buffer("places", torch.eye(root.coefficients.shape[-1])[list(kept)], persistent=False)
+        places = torch.eye(len(middle))[list(kept)].to(middle)
+        roots = places @ root.coefficients @ places.mT
+        costs = roots.abs().amax((0, -1))
+        roots[0] += torch.diag(torch.where(costs > 0, 0.0, FLAT**0.5 * costs.max()))  # the first function is 1
+        for name, value in (("places", places), ("middle", middle), ("roots", roots)):
+            self.register_buffer(name, value, persistent=False)
 
-    def shift(self, p: Tensor) -> State:
-        """y*(p) − y*(p̄)."""
-        return self.targets.shift(p) @ self.places.mT
+    def goal(self, p: Tensor) -> State:
+        """y*(p)."""
+        return (self.middle + self.targets.shift(p)) @ self.places.mT
 
     def pull_back(self, p: Tensor, v: State) -> Tensor:
         """The gradient of vᵀy*(p) in p."""
         return self.targets.pull_back(p, v @ self.places)
 
-    def definite_roots(self) -> Tensor:
-        """The coefficients of L(p) in y, with a small weight on states that cost nothing."""
-        roots = self.places @ self.root.coefficients @ self.places.mT
-        costs = roots.abs().amax((0, -1))
-        roots[0] += torch.diag(torch.where(costs > 0, 0.0, FLAT**0.5 * costs.max()))
-        return roots
+    def middle_cost(self) -> Tensor:
+        """P(p̄)."""
+        L = combine(self.basis(self.basis.center), self.roots)
+        return L @ L.mT
+
+    def relative(self, C: Tensor) -> Tensor:
+        """G with L(p̄)G = C."""
+        return torch.linalg.solve(combine(self.basis(self.basis.center), self.roots), C)
 
 
 class Timeless(ValueFunction):

@@ -99,7 +99,10 @@ def draw_examples(problem: Problem, optimum: Optimum, generator: torch.Generator
         ahead: whether the law to be fitted is the lookahead law.
     """
     optimum = _select_finite(optimum)
-    near = _limit_deviations(problem, optimum, _draw_deviations(optimum.expansion.x, generator), NEIGHBOUR_TRUST_LIMIT)
+    drawn = _draw_deviations(optimum.expansion.x, generator)
+    if problem.horizon.stationary:  # its V has the goal of the end of a range for each parameter beyond it
+        drawn = _within_ranges(problem, optimum.expansion.x[:-1], drawn)
+    near = _limit_deviations(problem, optimum, drawn, NEIGHBOUR_TRUST_LIMIT)
     return _build_examples(problem, optimum, [torch.zeros_like(near), near], ahead)
 
 
@@ -183,6 +186,17 @@ def _draw_deviations(x: StatePath, generator: torch.Generator) -> Tensor:
     before = (node * torch.rand(nodes, b, generator=generator)).long()
     share = torch.rand(nodes, b, 1, generator=generator, dtype=x.dtype) - 0.5
     return share * (x[before, neighbour] - x[before, every])
+
+
+def _within_ranges(problem: Problem, x: StatePath, deviation: Tensor) -> Tensor:
+    """The deviations from x without what leads a constant state out of its range in X₀."""
+    box, constants = problem.initial_states, list(problem.system.constants)
+    if not constants:
+        return deviation
+    low, high = (side.to(x)[constants] - x[..., constants] for side in (box.lower, box.upper))
+    within = deviation.clone()
+    within[..., constants] = deviation[..., constants].maximum(low).minimum(high)
+    return within
 
 
 def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:

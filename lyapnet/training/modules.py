@@ -241,7 +241,8 @@ def _compile_alike(rollouts: Sequence[Rollout], batch_size: int) -> None:
         return
     first, *others = loops
     X0 = rollouts[0].problem.initial_states
-    first.compile(X0.center.expand(batch_size, -1).contiguous())
+    # off the centre, which may be a goal, where V is rounding and compiled code may have another one
+    first.compile(((X0.center + X0.upper) / 2).expand(batch_size, -1).contiguous())
     for loop in others:
         if not loop.share_code(first, X0.sample(batch_size, torch.Generator().manual_seed(0))):
             loop.compile_like(first)

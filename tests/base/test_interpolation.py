@@ -8,7 +8,14 @@ from scipy.interpolate import CubicSpline, RegularGridInterpolator
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.base.interpolation import Curve, SmoothCurve
+from lyapnet.base.interpolation import (
+    ChebyshevProducts,
+    Curve,
+    FourierSeries,
+    Interpolant,
+    SmoothCurve,
+    fewest_products,
+)
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.value.calculus import gradients
@@ -198,3 +205,38 @@ def test_bounds_of_a_smooth_curve_have_no_kinks():
         return float((high - low).max())
 
     assert widest(0.001) < 0.2 * widest(0.01) < 1.0
+
+
+BASES = {
+    "products": ChebyshevProducts(torch.tensor([-1.0, 2.0]).double(), torch.tensor([3.0, 2.5]).double(), [4, 3]),
+    "one of no extent": ChebyshevProducts(torch.tensor([1.0, 2.0]).double(), torch.tensor([1.0, 2.5]).double(), [1, 5]),
+    "series": FourierSeries(1.7, 7),
+}
+
+
+@pytest.mark.parametrize("basis", BASES.values(), ids=BASES)
+def test_the_gradient_of_a_basis_is_autograds(basis):
+    nodes = basis.nodes().double()
+    low, high = nodes.amin(0), nodes.amax(0)
+    p = (low + (high - low) * torch.rand(20, nodes.shape[-1]).double()).requires_grad_()
+    c = torch.randn(20, len(nodes)).double()
+    (expected,) = torch.autograd.grad((torch.stack(basis(p), -1) * c).sum(), p)
+    assert_close(basis.gradient(p.detach(), c), expected)
+
+
+def test_the_fewest_products_that_are_accurate_are_found():
+    low, high = torch.tensor([0.0, -1.0, 2.0]).double(), torch.tensor([1.0, 1.0, 2.0]).double()
+
+    def function(p):
+        return (1 / (1.5 + p[..., 0]) + p[..., 1] ** 2)[..., None]
+
+    def is_accurate(basis, tested):
+        return bool((Interpolant(basis, function(basis.nodes()))(tested) - function(tested)).abs().max() < 1e-5)
+
+    tested = low + (high - low) * torch.rand(50, 3).double()
+    found = fewest_products(low, high, is_accurate, tested, most=100)
+    assert found is not None
+    assert found.counts == [9, 3, 1]
+    assert not is_accurate(ChebyshevProducts(low, high, [5, 3, 1]), tested)
+    assert not is_accurate(ChebyshevProducts(low, high, [9, 2, 1]), tested)
+    assert fewest_products(low, high, is_accurate, tested, most=27) is None

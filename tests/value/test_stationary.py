@@ -95,7 +95,6 @@ def test_states_that_nothing_depends_on_have_no_tail():
         (["cost.Q_T=1"], "no cost.Q_T with horizon.stationary"),
         (["cost.Q=[2,0,0]", "system.name=linear"], "Expected"),
         (["controls.lower=0"], "limits around the control at the goal"),
-        (["family={target_x1:[-1,1]}"], "family"),
     ],
 )
 def test_what_has_no_regulator_is_refused(changes, message):

@@ -16,7 +16,9 @@ from lyapnet.task.cost import RegulatorTail
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.build_learner import build_pointwise
+from lyapnet.training.pretraining import draw_examples
 from lyapnet.value.calculus import gradients
+from lyapnet.value.expansions import greedy_law, optimal_trajectories, path_under, riccati
 from lyapnet.value.networks import StationaryNetwork
 from tests.fits import shorten_fits
 from tests.task.test_setpoints import Tanks
@@ -248,6 +250,38 @@ def test_the_region_program_is_about_one_system():
 
     with pytest.raises(UsageError, match="one system with the region program, got a family"):
         build_pointwise(config, learner.rollout, build_program(config))
+
+
+def optima_of(task, count=6):
+    """Optimal closed loops from states of X₀ and members all over the ranges; and their problem."""
+    problem = problem_of(task, "horizon.steps=60")
+    box = problem.initial_states
+    x0 = torch.stack([box.lower + (box.upper - box.lower) * (k / (count - 1)) for k in range(count)])
+    path = path_under(problem, greedy_law(problem, riccati(problem)), x0)
+    return problem, optimal_trajectories(problem, x0, path.u, iterations=20)
+
+
+def test_examples_beside_optima_are_of_members_within_the_ranges(monkeypatch):
+    """Beyond them V has the goal of the end, and the expansion another one."""
+    problem, optimum = optima_of(TANKS)
+    low, high = 0.25 - 1e-12, 0.45 + 1e-12
+    p = draw_examples(problem, optimum, torch.Generator().manual_seed(0)).x[:, 2]
+    assert bool(((low <= p) & (p <= high)).all())
+    monkeypatch.setattr("lyapnet.training.pretraining._within_ranges", lambda problem, x, deviation: deviation)
+    p = draw_examples(problem, optimum, torch.Generator().manual_seed(0)).x[:, 2]
+    assert not bool(((low <= p) & (p <= high)).all()), "there are such deviations"
+
+
+def test_points_of_the_condition_approach_the_goals_of_the_members():
+    config = config_of(TANKS, "pointwise.weight=1", "pointwise.region=[0.3,0.3,0.1]")
+    (learner,) = build_module(config).members
+    condition, problem = learner.pointwise, learner.problem
+    _, z = condition.draw(torch.Generator().manual_seed(0))
+    away = problem.cost.from_goal(z)[:, :2].norm(dim=-1)
+    near = z[away < 0.01]
+    assert len(near) > 100
+    assert float(near[:, 2].min()) < 0.28, "not those of one member alone"
+    assert float(near[:, 2].max()) > 0.42
 
 
 @pytest.fixture(scope="module")

@@ -291,7 +291,7 @@ def run(tmp_path_factory):
     patch.setattr("lyapnet.training.start.MAX_OPTIMA", 24)
     shorten_fits(patch, 200, 100)
     folder = tmp_path_factory.mktemp("tanks")
-    outputs = {"measure": ["lower"], "noise": [1e-4], "estimate": {"drift": 1e-4}}
+    outputs = {"measure": ["lower"], "noise": [1e-4]}
     own = {**TANKS, "logs": str(folder), "trainer": {"accelerator": "cpu"}, "outputs": outputs, **FLOAT64}
     short = [*("training.iterations=3", "training.warmup=0", "rollout.compile=off", "loggers=[csv]"),
              *("evaluation.validation_states=8", "evaluation.test_states=16")]  # fmt: skip
@@ -301,7 +301,7 @@ def run(tmp_path_factory):
 
 @pytest.mark.gate
 def test_one_training_holds_each_setpoint_for_ever(run):
-    controller = load(run.best)
+    controller = load(run.best, system=Tanks())
     assert run.evaluation["after_T"] == "hold"
     assert 0.99 < run.evaluation["cost_ratio"] < 1.05
     for level in (0.25, 0.31, 0.45):
@@ -311,3 +311,16 @@ def test_one_training_holds_each_setpoint_for_ever(run):
         assert float(alone.value(0.0, [1.44 * level, level])) < 1e-12 < float(alone.value(0.0, [0.4, 0.5]))
     with pytest.raises(UsageError, match="got a family; choose one member"):
         certify(controller, Region())
+
+
+@pytest.mark.gate
+def test_a_setpoint_changes_in_the_loop_without_an_offset(run):
+    controller = load(run.best, system=Tanks())
+    loop, plant, x = controller.with_estimator(), Tanks(), torch.tensor([0.5, 0.35])
+    for level in (0.25, 0.45, 0.3):
+        for _ in range(400):
+            u = loop.step(x[1:], target_lower=level)
+            x = x + 0.05 * plant.dynamics(x, u)
+        assert_close(x, torch.tensor([1.44 * level, level]), atol=1e-3, rtol=0)
+        untold = controller.policy(0.0, x, target_lower=0.35)
+        assert abs(float(untold) - 1.2 * math.sqrt(level)) > 1e-3, "it is the setpoint that moves it"

@@ -259,7 +259,9 @@ def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) 
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
     if float(left.abs().max()) <= rounding * float(f.abs().max()):
-        remedy = f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing"
+        remedy = f"target: {goal.tolist()} has uᵀRu count u from there"
+        if problem.cost.nonquadratic is None:
+            remedy += ", so that staying costs nothing"
         if problem.cost.rest is not None:  # target_control says from where
             remedy = ""
         return Fact("goal", f"{where}held by u = {_format_vector(u)}, which the cost charges", remedy)

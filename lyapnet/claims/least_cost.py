@@ -128,7 +128,7 @@ class RiseCondition(DecreaseCondition):
         return self.alpha * self.V(t, x) - self.delta * (self.duration - t)
 
 
-FIXED_METHODS = ("running", "control")
+FIXED_METHODS = ("running", "smooth_running", "beside", "best_control", "control")
 
 
 def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: ControlSet) -> PerState:

@@ -212,7 +212,9 @@ def _controls(controller: Controller, config: Config) -> dict[str, Any]:
     """The limits of U with None for ∞; the class and parameters of another set; empty if U = ℝᵐ."""
     controls = controller.controls
     if controls.limits is None or not controls.is_box:
-        return {"name": f"{type(controls).__module__}:{type(controls).__qualname__}", **config.controls.parameters}
+        numbers = {name: each.tolist() for name, each in controls.named_buffers()}
+        name = f"{type(controls).__module__}:{type(controls).__qualname__}"
+        return {"name": name, **numbers, **config.controls.parameters}
     if not controls.limited:
         return {}
     sides = (side.expand(controller.system.m).tolist() for side in controls.limits)
@@ -236,6 +238,19 @@ def _cost(controller: Controller, config: Config) -> dict[str, Any]:
         cost = cost.cost
     about = {"with": "; ".join(filter(None, words))} if any(words) else {}
     if isinstance(cost, QuadraticCost):
-        return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T, **about}
+        return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T, **_control_costs(cost), **about}
     cls = type(cost)
-    return {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters, **about}
+    own = {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters}
+    return {**own, **_control_costs(cost), **about}
+
+
+def _control_costs(cost: Any) -> dict[str, Any]:
+    """The costs of controls beside uᵀRu, with their numbers."""
+    if cost.nonquadratic is None:
+        return {}
+    parts = [
+        {"name": type(part).__name__, **{name: numbers.tolist() for name, numbers in part.named_buffers()}}
+        | {name: value for name, value in vars(part).items() if name in ("exponent", "width")}
+        for part in cost.nonquadratic.costs
+    ]
+    return {"control_costs": parts}

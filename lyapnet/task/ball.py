@@ -1,7 +1,5 @@
 """The ball ‖u‖ ≤ r as a set of controls, and the minimiser of a quadratic cost and ‖u‖ in it."""
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -12,7 +10,7 @@ from lyapnet.task.sets import ControlSet
 
 NEWTON_STEPS = 10  # for a multiplier: they converge from one side, and double its digits at each step
 TINY = 1e-100  # replaces 0 in denominators
-INWARDS = 4  # units of rounding by which projected controls stay inside
+INWARDS = 8  # units of rounding by which projected controls are inside; they are projected from half of it on
 
 
 class ControlBall(ControlSet):
@@ -29,8 +27,8 @@ class ControlBall(ControlSet):
 
     def __init__(self, radius: float):
         super().__init__()
-        if isinstance(radius, bool) or not 0 < radius < math.inf:
-            raise ValueError(f"Expected a radius > 0, got {radius}; give the largest ‖u‖.")
+        if type(radius) not in (int, float) or not 1e-12 <= radius <= 1e12:
+            raise ValueError(f"Expected a radius > 0, got {radius!r}; give the largest ‖u‖.")
         self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.get_default_dtype()), persistent=False)
 
     @property
@@ -52,10 +50,13 @@ class ControlBall(ControlSet):
 
     def project(self, u: Control) -> Control:
         """u, or r u/‖u‖ up to rounding, which is inwards."""
-        within = self.radius * (1 - INWARDS * torch.finfo(u.dtype).eps)
+        rounding = INWARDS * torch.finfo(u.dtype).eps
+        within = self.radius * (1 - rounding)
+        if u.shape[-1] == 1:
+            return u.clamp(-within, within)
         largest = u.detach().abs().amax(-1, keepdim=True).clamp_min(torch.finfo(u.dtype).tiny)  # squares may overflow
         size = largest * norm(u / largest)[..., None]
-        return torch.where(size > within, u * (within / torch.where(size > 0, size, 1.0)), u)
+        return torch.where(size > self.radius * (1 - rounding / 2), u * (within / torch.where(size > 0, size, 1.0)), u)
 
     def extra_repr(self) -> str:
         return f"radius={float(self.radius):g}"

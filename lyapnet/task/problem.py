@@ -179,11 +179,13 @@ class Problem(nn.Module):
 
     def smooth_rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The same without s(u), the cost of controls beside uᵀRu."""
+        own = self.cost.nonquadratic is None  # a cost of a user's may have `running` of its own
+        running = self.cost.running if own else self.cost.smooth_running
         tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
         for row in tableau.a:
             X = x + self.horizon.dt * weighted_sum(row, slopes) if any(row) else x
             slopes.append(self.system.dynamics(X, u))
-            costs.append(self.cost.smooth_running(X, u))
+            costs.append(running(X, u))
         return weighted_sum(tableau.b, slopes), weighted_sum(tableau.b, costs)
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
@@ -446,7 +448,7 @@ class Problem(nn.Module):
         if (rest := cost.rest_at(x)) is not None:
             numbers["u*"] = rest.expand(3, m)
         if cost.nonquadratic is not None:
-            numbers["s"] = cost.beside(own.best_control(torch.eye(m, dtype=x.dtype).expand(3, m, m), b))
+            numbers["s"] = cost.beside(cost.nonquadratic.told_apart(m))
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
         if own.noise is not None:
@@ -475,7 +477,7 @@ class Problem(nn.Module):
             unsaid["σσᵀ"], own = none, {"σσᵀ": none, **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}
-        unsaid["s"] = [0.0] * 3
+        unsaid["s"] = [0.0] * 2 * m
         if "s" in record:
             own = {"s": unsaid["s"], **own}
         if "risk" in record:

@@ -98,6 +98,8 @@ class _Solver:
 
     def __call__(self, goal: State) -> Gains:
         exact, u = self.exact, self.exact.rest_at(goal)
+        if exact.cost.nonquadratic is not None:
+            raise ValueError(f"Expected controls that cost uᵀRu alone for {self.purpose}, got more; {self.instead}.")
         if float(exact.system.dynamics(goal, u).abs().max()) > EQUILIBRIUM_TOLERANCE:
             raise ValueError(f"Expected a goal that is an equilibrium for {self.purpose}, got another; {self.instead}.")
         jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian

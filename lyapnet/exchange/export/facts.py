@@ -32,7 +32,7 @@ def facts_of(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
     facts["X₀"] = _ranges(names, units, box.lower, box.upper, states)
     if constants:
         facts["P"] = _ranges(names, units, box.lower, box.upper, constants)
-    facts["limits"] = "none"
+    facts["limits"] = "none" if not problem.controls.limited else str(problem.controls)
     if isinstance(problem.controls, ControlBox):
         low, high = (side.expand(system.m) for side in (problem.controls.lower, problem.controls.upper))
         facts["limits"] = _ranges(system.control_names, system.control_units, low, high, range(system.m))

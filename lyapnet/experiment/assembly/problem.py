@@ -219,7 +219,7 @@ def _with_control_costs(config: Config, cost: Cost, controls: ControlSet, m: int
     Raises:
         UsageError: the costs and the control set have no known minimiser, or the task is stationary.
     """
-    costs = control_costs_of(config.cost, m)
+    costs = control_costs_of(config.cost, m) or cost.nonquadratic
     if costs is None:
         return controls
     if config.horizon.stationary:

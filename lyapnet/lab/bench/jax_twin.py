@@ -77,7 +77,7 @@ class JaxTwin:
                 raise UsageError(f"Expected parts among {known}, got {type(part).__name__}; it has no twin in JAX.")
         inverse_mass = problem.system.inverse_mass if isinstance(problem.system, MechanicalSystem) else None
         cost = problem.cost
-        if not isinstance(cost, QuadraticCost) or problem.controls.limited:
+        if not isinstance(cost, QuadraticCost) or not problem.has_linear_law:
             raise UsageError(
                 "Expected a quadratic cost and controls without limits, got others; they have no twin in JAX."
             )

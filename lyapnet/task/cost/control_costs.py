@@ -4,6 +4,7 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,7 @@ NEWTON_STEPS = 12  # of the minimiser with smooth costs, in traces
 SCALAR_STEPS = 12  # for a single control
 SCALAR_STEPS_FROM_AFAR = 40  # where no slope of the smooth costs bounds it beforehand
 MOST_NEWTON_STEPS = 60  # where values tell when it has converged
+LEAST_WEIGHT = 1e-12  # smallest weight, limit or width that is not taken for a mistake, and the inverse of the largest
 LEAST_EXPONENT = 1.2  # closer to 1 rounding hides where the minimum is
 CONVERGED = 1e-14  # a change of u, relative to u, at which it has
 STEP_SIZES = (1.0, 0.5, 0.125, 0.0156, 0.001)  # of its line search
@@ -44,12 +46,14 @@ class SeparableCost(ControlCost, ABC):
     A subclass of your own has `forward`, a smooth function; the other methods differentiate it.
 
     Args:
-        weight: w ≥ 0, a number or one for each control.
+        weight: w > 0, a number or one for each control; of absolute costs some may be 0.
     """
+
+    least_weight: ClassVar[float] = LEAST_WEIGHT
 
     def __init__(self, weight: float | Sequence[float] | Tensor):
         super().__init__()
-        self.register_buffer("weight", _weights(weight), persistent=False)
+        self.register_buffer("weight", _weights(weight, least=self.least_weight), persistent=False)
 
     def slope(self, u: Control) -> Control:
         """The derivative by each control."""
@@ -79,6 +83,8 @@ class SeparableCost(ControlCost, ABC):
 
 class AbsoluteCost(SeparableCost):
     """s(u) = Σ wᵢ|uᵢ|: fuel, or the energy of an actuator that pays for what it moves."""
+
+    least_weight = 0.0
 
     def forward(self, u: Control) -> PerState:
         return (self.weight * u.abs()).sum(-1)
@@ -225,14 +231,16 @@ class NormCost(ControlCost):
     """s(u) = w‖u‖, the fuel of a thrust in any direction.
 
     Args:
-        weight: w ≥ 0.
+        weight: w > 0.
     """
 
     weight: Float[Tensor, ""]
 
     def __init__(self, weight: float):
         super().__init__()
-        self.register_buffer("weight", _weights(float(weight)), persistent=False)
+        self.register_buffer("weight", _weights(weight), persistent=False)
+        if self.weight.ndim:
+            raise ValueError(f"Expected one weight of the norm, got {weight!r}; it is of all controls together.")
 
     def forward(self, u: Control) -> PerState:
         return self.weight * norm(u)
@@ -284,6 +292,13 @@ class ControlCosts(nn.Module):
         for cost in self.costs:
             value = value + cost(u)
         return value
+
+    def told_apart(self, m: int) -> Control:
+        """Controls (2m, m) whose costs tell sums apart: each control by itself at two sizes below the open limits."""
+        each = torch.eye(m, dtype=torch.float64)
+        for end in self.open_limits:
+            each = each * (0.9 * end.double().expand(m)).clamp_max(1.0)
+        return torch.cat([each, 0.3 * each])
 
     def require_minimiser(self, controls: ControlSet, m: int) -> None:
         """Refuse costs and a set whose minimiser is not known.
@@ -363,6 +378,8 @@ def _minimise_one(smooth: Sequence[SeparableCost], kinks: Tensor | None, bend: T
                 break
     slope, curvature = slope_and_curvature(a)
     a = torch.where(curvature.isfinite(), a - slope / curvature.detach(), 0.0)
+    for end in ControlCosts(smooth).open_limits:
+        a = a.minimum((1 - LEAST_ROOM) * end)
     return -b.sign() * a
 
 
@@ -451,13 +468,16 @@ def local_shape(
         u: the minimiser (*batch, m).
         slope: that of the quadratic cost there.
     """
-    if isinstance(controls, ControlBall) or _norm_of(cost) is not None:
+    one = u.shape[-1] == 1  # a ball is a box, and a norm is |u|
+    if not one and (isinstance(controls, ControlBall) or _norm_of(cost) is not None):
         return _shape_in_ball(cost, controls, u, slope)
     parts = [] if cost is None else cost.separable
     whole = slope + sum((part.slope(u) for part in parts), torch.zeros_like(u))
+    if (weight := _norm_of(cost)) is not None:
+        whole = whole + weight * u.sign()
     further = controls.project(u - whole.sign() * (1 + u.abs()))
     moves = (further != u) | (whole == 0)
-    if any(isinstance(part, AbsoluteCost) for part in parts):
+    if cost is not None and cost.kinked:
         moves = moves & (u != 0)
     if cost is None:
         return torch.diag_embed(moves.to(u)), None
@@ -510,19 +530,24 @@ def _minimise_with_kinks(controls: ControlSet, R: ControlMatrix, b: Control, kin
     return u.gather(0, best[None, ..., None].expand(1, *b.shape))[0].to(b)
 
 
-def _weights(weight: float | Sequence[float] | Tensor, name: str = "weight") -> Tensor:
-    """Weights of controls as a tensor."""
+def _weights(weight: float | Sequence[float] | Tensor, name: str = "weight", least: float | None = None) -> Tensor:
+    """Weights of controls as a tensor, each between `least` and the inverse of LEAST_WEIGHT."""
+    least = LEAST_WEIGHT if least is None else least
+    entries = weight if isinstance(weight, list | tuple) else [weight]
     try:
+        if not isinstance(weight, Tensor) and not all(type(entry) in (int, float) for entry in entries):
+            raise TypeError("no numbers")
         given = torch.as_tensor(weight, dtype=torch.get_default_dtype()).clone()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         given = torch.empty(0)
-    if given.ndim > 1 or not given.numel() or not bool((given.isfinite() & (given > 0)).all()):
+    inside = given.isfinite() & (given >= least) & (given <= 1 / LEAST_WEIGHT)
+    if given.ndim > 1 or not given.numel() or not bool(inside.all()) or not bool((given > 0).any()):
         raise ValueError(f"Expected {name} as a number > 0, or one for each control, got {weight!r}; correct it.")
     return given
 
 
 def _positive(name: str, number: float) -> float:
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
+    if type(number) not in (int, float) or not LEAST_WEIGHT <= number <= 1 / LEAST_WEIGHT:
         raise ValueError(f"Expected {name} > 0, got {number!r}; correct it.")
     return float(number)
 

@@ -292,8 +292,9 @@ def softness_of_kinks(problem: Problem) -> float:
         return 0.0
     weight = float(sum(cost.weight.max() for cost in costs.kinked))
     R = float(torch.linalg.eigvalsh(problem.cost.R(problem.initial_states.center))[..., 0])
-    largest = [weight / R, *(float(side.abs().max()) for side in problem.controls.limits or ())]
-    return weight / min(largest)
+    sizes = [float(torch.stack([side.abs() for side in problem.controls.limits or ()] or [torch.tensor(0.0)]).max())]
+    sizes = [size for size in (*sizes, weight / R) if 0 < size < math.inf]
+    return weight / min(sizes)
 
 
 def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
@@ -362,7 +363,7 @@ def backward_recursion(
         regularised = regularise(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
         gain = gain_of_node(problem, u[k], regularised, Q_ua)
         W = Q[..., : 1 + n, : 1 + n] + gain.mT @ (Q_ua + Q_uu @ gain) + Q_ua.mT @ gain
-        if problem.cost.nonquadratic is not None:
+        if problem.cost.nonquadratic is not None or not problem.controls.is_box:
             W += cost_beside(problem, u[k], gain, Q_ua + regularised @ gain)
         W = (W + W.mT) / 2
         nodes.append(W)

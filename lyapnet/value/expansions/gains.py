@@ -31,7 +31,7 @@ def gain_of_node(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Te
 
 
 def cost_beside(problem: Problem, u: Control, gain: Tensor, left: Tensor) -> Tensor:
-    """What s(u) adds to W = [[2c, pᵀ], [p, H]] of a node: Δt s(u + k) in c, and to second order in x.
+    """What s(u) and a curved border of U add to W = [[2c, pᵀ], [p, H]] of a node: Δt s(u + k) in c, and in p and H.
 
     At the minimum k the slope of Δt s along K is −(Q_u + Q_uu k), and its curvature along K is −(Q_ux + Q_uu K).
 

@@ -9,7 +9,9 @@ from lyapnet.controller.controller import Controller
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.ball import ControlBall
-from lyapnet.task.cost.control_costs import SeparableCost
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.cost.control_costs import AbsoluteCost, SeparableCost
+from lyapnet.task.problem import Problem
 from lyapnet.task.sets import ControlBox
 from lyapnet.value.policy import HJBPolicy, SontagPolicy
 from tests.problems import Quadratic
@@ -26,6 +28,50 @@ class Fourth(SeparableCost):
 
     def forward(self, u):
         return (self.weight * u**4).sum(-1)
+
+
+class Kinked(SeparableCost):
+    def forward(self, u):
+        return (self.weight * u.abs()).sum(-1)
+
+
+class Concave(SeparableCost):
+    def forward(self, u):
+        return -(self.weight * u**2).sum(-1)
+
+
+class Uneven(SeparableCost):
+    def forward(self, u):
+        return (self.weight * (u.exp() - 1 - u)).sum(-1)
+
+
+class Lifted(SeparableCost):
+    def forward(self, u):
+        return (self.weight * u**4).sum(-1) + 1
+
+
+class Dearer(AbsoluteCost):
+    def forward(self, u):
+        return 3 * super().forward(u)
+
+
+class Shapeless(SeparableCost):
+    def forward(self, u):
+        return self.weight * u**4
+
+
+class Unmade(SeparableCost):
+    def __init__(self, weight):
+        self.weight = weight
+
+    def forward(self, u):
+        return (u**4).sum(-1)
+
+
+@pytest.mark.parametrize("cls", [Kinked, Concave, Uneven, Lifted, Dearer, Shapeless, Unmade])
+def test_a_cost_of_a_users_own_that_breaks_the_contract_is_refused(cls):
+    with pytest.raises(UsageError, match=r"Expected .+, got .+[;:,] .+"):
+        problem({"name": f"{__name__}:{cls.__name__}", "weight": 0.5})
 
 
 def problem(*costs, controls=None, **sections):
@@ -54,8 +100,10 @@ def test_a_cost_with_a_limit_of_its_own_needs_no_other():
     assert isinstance(task.controls, ControlBox)
     assert_close(task.controls.upper, torch.tensor([3.0, 4.0]), rtol=1e-5, atol=0)
     assert task.cost.beside(task.controls.upper).isfinite()
-    own = {"lower": -1, "upper": 5}
-    assert problem({"name": "log_cos", "weight": 1, "limit": 3}, controls=own).controls.upper.tolist() == [5.0, 5.0]
+    tighter = problem({"name": "log_cos", "weight": 1, "limit": 3}, controls={"lower": -1, "upper": 5}).controls
+    assert_close(torch.stack([tighter.lower, tighter.upper]), torch.tensor([[-1.0, -1], [3, 3]]), rtol=1e-5, atol=0)
+    with pytest.raises(UsageError, match=r"Expected cost.control_costs that are finite between .+, got others; .+\."):
+        problem({"name": "log_cos", "weight": 1, "limit": 1}, controls={"lower": 2, "upper": 3})
 
 
 def test_a_cost_of_a_users_own():
@@ -100,6 +148,9 @@ def test_other_parts_refuse_what_they_do_not_know():
 def test_a_record_tells_tasks_with_other_costs_of_controls_apart():
     tasks = [problem(), *(problem({"name": "norm", "weight": w}, controls=BALL) for w in (1, 2))]
     tasks.append(problem(controls=BALL))
+    box = {"lower": -1, "upper": 1}
+    tasks += [problem({"name": "absolute", "weight": w}, controls=box) for w in ([0.3, 0.5], [0.5, 0.3], 2e4)]
+    tasks.append(problem(controls=box))
     for i, one in enumerate(tasks):
         for j, other in enumerate(tasks):
             assert bool(one.differences(other.record())) == (i != j), (i, j)
@@ -113,3 +164,17 @@ def test_a_controller_of_such_a_task_stays_in_the_ball():
     assert float(size.max()) == pytest.approx(2.0, rel=1e-9)
     assert task.controls.contains(u).all()
     assert (size == 0).any()
+
+
+class Taxed(QuadraticCost):
+    """A cost whose controls pay more than R says, by `running` of its own."""
+
+    def running(self, x, u):
+        return super().running(x, u) + 5
+
+
+def test_running_of_a_users_own_is_paid_in_every_step():
+    plain = problem()
+    cost = Taxed(torch.eye(4), torch.eye(2), torch.eye(4))
+    task = Problem(plain.system, cost, plain.controls, plain.initial_states, plain.horizon)
+    assert_close(task.step(torch.zeros(1, 4), torch.zeros(1, 2))[1], torch.tensor([0.5]))

@@ -34,6 +34,11 @@ CASES = {
     "absolute": lambda: problem_with([AbsoluteCost([0.3, 0.5])], ControlBox(-1.0, 1.0)),
     "power": lambda: problem_with([PowerCost(0.3, 1.5)], Unbounded()),
     "power, rk4": lambda: problem_with([PowerCost(0.3, 1.5)], Unbounded(), method="rk4"),
+    "power of one control in a ball": lambda: problem_with([PowerCost(0.3, 1.5)], ControlBall(3.0), Pendulum()),
+    "norm and log-cos of one control": lambda: problem_with(
+        [NormCost(0.05), LogCosCost(0.05, 4.0)], ControlBox(-3.9999, 3.9999), Pendulum()
+    ),
+    "a thruster": lambda: problem_with([AbsoluteCost(0.3)], ControlBox([0.0, -1.0], [1.0, 0.0])),
     "log-cos": lambda: problem_with([LogCosCost(0.05, 4.0)], ControlBox(-3.9999, 3.9999), Pendulum()),
 }
 
@@ -72,8 +77,11 @@ def test_the_expansion_has_the_slope_and_curvature_of_the_optimal_cost(solved, m
     own = optimum.expansion.gradient[0] @ d
     assert_close(own, slope, rtol=1e-5, atol=1e-6)
     curvature = (ends[0] + ends[1] - 2 * optimum.path.cost) / h**2
-    assert_close((optimum.expansion.hessian[0] @ d) @ d, curvature, rtol=0.2, atol=0.02)
-    if problem.cost.nonquadratic is None:
+    own = (optimum.expansion.hessian[0] @ d) @ d
+    off = (own - curvature).abs() > 0.02 * curvature.abs() + 0.01
+    kinked = problem.cost.nonquadratic is not None
+    assert off.sum() <= kinked, "beside a switch the difference has another slope on each side"
+    if not kinked:
         return
     monkeypatch.setattr(dynamic_programming, "cost_beside", lambda *_: 0.0)
     other = optimal_trajectories(problem, x0, optimum.path.u).expansion

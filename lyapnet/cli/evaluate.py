@@ -51,7 +51,7 @@ def evaluate(
     """
     from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
     from lyapnet.evaluation.measurement import evaluation
-    from lyapnet.evaluation.robustness import robustness
+    from lyapnet.evaluation.robustness import not_varied, robustness
     from lyapnet.evaluation.tables import evaluation_table
 
     if table is not None and not table.parent.is_dir():
@@ -74,6 +74,7 @@ def evaluate(
     if disturbed:
         rows = robustness(controller, count, seed, optimum, lambda name: report(f"disturbance: {name}"))
         result["robustness"] = [row._asdict() for row in rows]
+        result["robustness_unchanged"] = not_varied(controller)
     later = []
     if until is not None:
         report(f"closed loops up to {until:g} T")
@@ -101,8 +102,8 @@ def _print_further_tables(result: dict[str, Any], controller: "Controller", coun
 
     console, noisy = Console(highlight=False, markup=False), controller.problem.noise is not None
     if "robustness" in result:
-        member = nominal(controller) if controller.system.constants else {}
-        console.print(robustness_table(result["robustness"], count, member, noisy))
+        unchanged = result["robustness_unchanged"]
+        console.print(robustness_table(result["robustness"], count, nominal(controller), noisy, unchanged))
     if "afterwards" in result:
         console.print(after_horizon_table(result["afterwards"], count, noisy))
 

@@ -22,22 +22,31 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
 BEYOND = 0.2  # relative change of X₀'s extent and of each physical parameter
+EARTH = (9.7, 9.9)  # m/s²: a parameter `gravity` between these is that of the Earth, which is what it is
 NOISE = 0.01  # standard deviation of the measured x_i, relative to the largest |x_i| of the undisturbed loop
 
 
 def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """The positive real numbers among a constructor's arguments, except gravity.
+    """The parameters that are varied, see `unchanged_parameters`."""
+    unchanged = unchanged_parameters(system, parameters)
+    return {name: float(value) for name, value in parameters.items() if name not in unchanged}
 
-    An integer counts if the constructor expects a float, as for a mass of 1 kg, but not for 3 links.
+
+def unchanged_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Name ↦ reason of a constructor's arguments of which no share is taken: all but positive real numbers.
+
+    An integer counts as real if the constructor expects a float, as for a mass of 1 kg, but not for 3 links.
     """
     arguments = inspect.signature(type(system)).parameters
-    return {
-        name: float(value)
-        for name, value in parameters.items()
-        if name != "gravity"
-        and (type(value) is float or (type(value) is int and arguments[name].annotation in (float, "float")))
-        and value > 0
-    }
+
+    def reason(name: str, value: Any) -> str:
+        if type(value) is not float and not (type(value) is int and arguments[name].annotation in (float, "float")):
+            return "no real number"
+        if value <= 0:
+            return f"{value:g}, not positive"
+        return f"{value:g} m/s² of the Earth" if name == "gravity" and EARTH[0] <= value <= EARTH[1] else ""
+
+    return {name: why for name, value in parameters.items() if (why := reason(name, value))}
 
 
 class Disturbance(NamedTuple):
@@ -118,7 +127,8 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
     """The task itself and its disturbances, each from `samples` initial states:
 
     1. initial states up to 20 % outside X₀, none inside;
-    2. each positive physical parameter, except gravity, 20 % lower and higher; policy and cost use the old value;
+    2. each positive physical parameter 20 % lower and higher, see `unchanged_parameters`; policy and cost use the old
+       value;
     3. noise of 1 % on the measured state;
     4. a delay of one sample, without and with a prediction by the model, see LatePolicy;
     5. half the Δt;
@@ -128,7 +138,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
     For a family it is the task of one member, see `nominal`. If V accepts the disturbed parameter, there is also the
     task in which V is told its value.
     """
-    family = dict[str, float]() if not controller.system.constants else nominal(controller)
+    family = nominal(controller)
     ranges = ranges_of(controller.config, controller.system) if isinstance(controller.system, FamilySystem) else {}
     whole, controller = controller, controller.with_(**family) if family else controller
     X0 = controller.initial_states
@@ -165,9 +175,13 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
 
 def nominal(family: Controller) -> dict[str, float]:
-    """The nominal member of a family: the parameters of the config, else the middle of each range of p."""
+    """The nominal member of a family: the parameters of the config, else the middle of each range of p.
+
+    Empty if the task is no family.
+    """
     system = family.system
-    assert isinstance(system, FamilySystem)
+    if not isinstance(system, FamilySystem):
+        return {}
     ranges = ranges_of(family.config, system)
     middle = {
         name: math.sqrt(least * greatest) if name in system.weights else (least + greatest) / 2
@@ -175,6 +189,13 @@ def nominal(family: Controller) -> dict[str, float]:
     }
     given = {name: getattr(system.system, name, middle[name]) for name in middle}
     return {name: value if knows(ranges[name], value) else middle[name] for name, value in given.items()}
+
+
+def not_varied(controller: Controller) -> dict[str, str]:
+    """Name ↦ reason of the parameters, of a family's nominal member, that have no row; see `unchanged_parameters`."""
+    family = nominal(controller)
+    member = controller.with_(**family) if family else controller
+    return unchanged_parameters(member.system, member.parameters)
 
 
 def robustness(

@@ -209,11 +209,14 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     return Text(caption) if notes else None  # Text, because [oracle] in a string would be markup
 
 
-def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float], noisy: bool) -> Table:
+def robustness_table(
+    rows: list[dict[str, Any]], samples: int, member: Mapping[str, float], noisy: bool, unchanged: Mapping[str, str]
+) -> Table:
     """The table of costs under disturbances; for a family, in the task of one member.
 
     Args:
         noisy: whether the task has noise, which these costs are without.
+        unchanged: name ↦ reason of the parameters without a row.
     """
     named = ", ".join(f"{name} = {value:g}" for name, value in member.items())
     title = f"{samples} states each" + f" of the member {named}" * bool(named)
@@ -225,7 +228,8 @@ def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[s
         cost, *others = (measured_or_not(key, row[key]) for key in keys)
         table.add_row(row["disturbance"], "diverged" if row["cost_mean"] is None else cost, *others)
     costs = f"J and J*: {WITHOUT_NOISE}. " if noisy else ""
-    table.caption = f"{costs}J*: the optimum if the disturbance is known"
+    left = ", ".join(f"{name.replace('_', ' ')} ({why})" for name, why in unchanged.items())
+    table.caption = Text(f"{costs}J*: the optimum if the disturbance is known" + f". Not varied: {left}" * bool(left))
     return table
 
 

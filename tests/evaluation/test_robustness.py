@@ -9,7 +9,14 @@ from torch.testing import assert_close
 
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import robustness
-from lyapnet.evaluation.robustness import LatePolicy, disturbances
+from lyapnet.evaluation.robustness import (
+    LatePolicy,
+    disturbances,
+    not_varied,
+    physical_parameters,
+    unchanged_parameters,
+)
+from lyapnet.evaluation.tables import robustness_table
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import DoubleIntegrator, Linear
@@ -61,6 +68,36 @@ def test_each_parameter_changes_the_plant_alone():
         if "noise" not in name and "late" not in name
     )
     assert controller.system.pole_mass == 1
+
+
+class Loaded(Linear):
+    """A joint, with a torque called gravity."""
+
+    def __init__(self, gravity: float = 0.6, links: int = 3, friction: float = 0.0):
+        super().__init__([[0.0, 1.0], [gravity, -friction]], [[0.0], [1.0]])
+
+
+@pytest.mark.parametrize(("gravity", "varied"), [(0.6, True), (1.62, True), (9.81, False), (9.8, False), (9, True)])
+def test_a_parameter_called_gravity_stays_where_it_is_that_of_the_earth(gravity, varied):
+    parameters = {"gravity": gravity, "links": 3, "friction": 0.0}
+    system = Loaded(**parameters)
+    assert physical_parameters(system, parameters) == ({"gravity": gravity} if varied else {})
+    reasons = unchanged_parameters(system, parameters)
+    assert reasons == {
+        **({} if varied else {"gravity": f"{gravity:g} m/s² of the Earth"}),
+        "links": "no real number",
+        "friction": "0, not positive",
+    }
+
+
+def test_what_has_no_row_is_named_below_the_table():
+    unchanged = not_varied(untrained("cartpole_swingup", *SMALL))
+    assert unchanged == {"cart_damping": "0, not positive", "gravity": "9.81 m/s² of the Earth"}
+    for given, ends in (
+        (unchanged, "Not varied: cart damping (0, not positive), gravity (9.81 m/s² of the Earth)"),
+        ({}, "known"),
+    ):
+        assert str(robustness_table([], 3, {}, False, given).caption).endswith(ends)
 
 
 def test_noise_is_on_what_the_policy_reads(controller):

@@ -109,7 +109,11 @@ def facts_of(
 
 
 def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[Fact]:
-    """Whether the outputs of a config tell the state along closed loops of the start; none without outputs."""
+    """Whether the outputs of a config tell the state along closed loops of the start; none without outputs.
+
+    The process noise of states that move is not held against the outputs: how far it drives them in a step is no matter
+    of X₀. What is constant in the model, parameters and disturbances, is known no better than its walk leaves it.
+    """
     if config is None or (parts := estimator_parts(config, in_float64(learner.problem))) is None:
         return []
     problem, outputs, drift, deviation = parts
@@ -131,8 +135,18 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     count = len(estimated)
     condition = f"condition {found.condition:.2g}" if found.rank == count else f"rank {found.rank} of {count}"
     known = f"standard deviations at T: {told}; {condition} of the Gramian along {x.shape[1]} loops of the start"
-    if not vague:
+    walking = [name for i, name in estimated if i in system.constants and found.deviation[i] > VAGUE * deviation[i]]
+    if not vague and not walking:
         return [Fact(OBSERVABLE, f"yes; {known}")]
+    if not vague:
+        listed = ", ".join(walking)
+        return [
+            Fact(
+                OBSERVABLE,
+                f"no: at T more than half of the first uncertainty is left of {listed}, as it walks; {known}",
+                f"a smaller walk of {listed} in outputs, or readings that tell more of it",
+            )
+        ]
     listed = ", ".join(vague)
     return [
         Fact(

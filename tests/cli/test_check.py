@@ -79,6 +79,19 @@ def test_states_that_outputs_do_not_tell_are_named():
     assert observed(mass, {}) is None
 
 
+@pytest.mark.usefixtures("without_start")
+@pytest.mark.parametrize(("walk", "named"), [(0.01, False), (0.5, True)])
+def test_a_parameter_that_walks_faster_than_outputs_tell_is_named(walk, named):
+    """The first uncertainty of the length is 0.4/√12 = 0.12 m; the walk of 0.5 m per √s outruns the readings."""
+    family = {"system": {"name": "pendulum"}, "family": {"length": [0.8, 1.2]}, "horizon": {"steps": 60, "dt": 0.05}}
+    outputs = {"measure": ["angle"], "noise": 0.01, "process_noise": {"length": walk}}
+    config = config_from_plain(linear([[0, 1], [0, 0]], [[0], [1]], outputs=outputs, **family))
+    (found,) = [fact for fact in found_of(config, outputs=config.outputs) if fact.name == "observable"]
+    expected = "no: at T more than half of the first uncertainty is left of length, as it walks; " if named else "yes; "
+    assert found.found.startswith(expected)
+    assert found.advice.startswith("a smaller walk of length") == named
+
+
 def test_check_names_what_outputs_do_not_tell(tmp_path, capsys):
     (tmp_path / "task.yaml").write_text(yaml.safe_dump(TASK))
     command = ["check", str(tmp_path / "task.yaml"), "--json", "outputs.measure=[angle]"]

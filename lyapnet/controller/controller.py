@@ -20,7 +20,7 @@ from lyapnet.controller.origin import Origin
 from lyapnet.controller.output_feedback import OutputFeedback, in_form_of
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member, named, ranges_of
 from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
-from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig
+from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig, require_one_for_each
 from lyapnet.experiment.schema import check_values
 from lyapnet.loop.programs import Program, ValueProgram
 from lyapnet.loop.random_plants import RandomPlants
@@ -313,6 +313,7 @@ class Controller:
         known = OutputsConfig() if self._config is None else self._config.outputs
         section = replace(known, **{key: value for key, value in given.items() if value is not None})
         check_values(section, "outputs.")
+        require_one_for_each(None if noise is None or np.ndim(noise) == 0 else list(noise), section.measure)
         plants = self.plants
         problem = self.problem if plants is None else plants.problem
         if (parts := estimator_parts(section, copied(problem))) is None:

@@ -372,7 +372,25 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     """
     content = read_yaml(path, Config)
     config = config_from_plain({"experiment": Path(path).stem, **content}, overrides)
+    _require_noise_of_each(content, overrides, config.outputs)
     return _with_reference(config, Path(path).parent)
+
+
+def _require_noise_of_each(content: Mapping[str, Any], overrides: Sequence[str], outputs: OutputsConfig) -> None:
+    """Require a list outputs.noise to have one entry for each reading; only a number written as such is for all."""
+    layers = OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))
+    written = OmegaConf.select(OmegaConf.merge(*layers), "outputs.noise")
+    require_one_for_each(written if OmegaConf.is_list(written) else None, outputs.measure)
+
+
+def require_one_for_each(noise: Sequence[float] | None, measure: Sequence[str]) -> None:
+    """Raise UsageError for a list of one standard deviation for several readings."""
+    if noise is not None and len(noise) == 1 < len(measure):
+        listed = ", ".join(measure)
+        raise UsageError(
+            f"Expected outputs.noise with {len(measure)} entries ({listed}), got {list(map(float, noise))}; give one for "
+            "each, or a number without brackets for all."
+        )
 
 
 def _with_reference(config: Config, folder: Path) -> Config:
@@ -397,6 +415,7 @@ def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     standard = {key: {**STANDARD[key], **section} for key, section in given.items() if isinstance(section, Mapping)}
     config = checked(Config, {**content, **standard}, overrides)
     check_values(config.horizon, "horizon.")
+    _require_noise_of_each(content, overrides, config.outputs)
     return config
 
 
@@ -428,8 +447,11 @@ def to_plain(config: Config) -> dict[str, Any]:
 
 
 def to_yaml(config: Config) -> str:
-    """The resolved config as YAML."""
-    return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
+    """The resolved config as YAML; one number for all readings is written as such."""
+    plain = to_plain(config)
+    if len(plain["outputs"]["noise"] or []) == 1:
+        (plain["outputs"]["noise"],) = plain["outputs"]["noise"]
+    return OmegaConf.to_yaml(OmegaConf.create(plain))
 
 
 def differing_keys(one: Config, other: Config) -> list[str]:

@@ -121,7 +121,7 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
                 if f.metadata.get("folder") and re.search(r"\$\{[^}]*:", str(given.get(f.name, ""))):
                     raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
         written, given = layers
-        layers = [_drop_other_kinds(written, given, schema), given]
+        layers = [_drop_replaced(written, given, schema), given]
         merged = OmegaConf.merge(_defaults(schema), *(OmegaConf.create(layer) for layer in layers))
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
@@ -207,19 +207,31 @@ def _numbers_to_lists(content: Mapping[str, Any], schema: type, prefix: str = ""
     return found
 
 
-def _drop_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
-    """Remove values that a later layer replaces by another kind, in fields that accept both lists and mappings."""
+def _drop_replaced(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
+    """Remove what a later layer replaces and a merge would keep beside it.
+
+    That is a list for a mapping or the other way round, in fields that accept both, and in a mapping the same name with
+    another spelling of its spaces.
+    """
     found = dict(content)
     for f in dataclasses.fields(schema):  # pyright: ignore
         value, other = content.get(f.name), later.get(f.name)
         if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
             if isinstance(value, Mapping) and isinstance(other, Mapping):
-                found[f.name] = _drop_other_kinds(value, other, f.type)
+                found[f.name] = _drop_replaced(value, other, f.type)
         elif (
             f.metadata.get("mapping") and isinstance(value, Mapping) != isinstance(other, Mapping) and other is not None
         ):
             found.pop(f.name, None)
+        elif isinstance(value, Mapping) and isinstance(other, Mapping):
+            replaced = {joined(name) for name in other}
+            found[f.name] = {name: one for name, one in value.items() if name in other or joined(name) not in replaced}
     return found
+
+
+def joined(name: Any) -> str:
+    """A name with _ for its spaces, by which names of a config are compared."""
+    return str(name).replace(" ", "_")
 
 
 def _require_numbers(key: str, value: Any, doc: str) -> None:

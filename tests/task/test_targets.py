@@ -148,7 +148,7 @@ def test_the_shipped_one():
         ("target=[1,2,3]", "target with 2 entries"),
         ("target=[0.7,1]", "a target that some control holds, .* got 1 for the rate of angle"),
         ("target_control=[1,2]", "target_control with one entry"),
-        ("controls={lower: -1, upper: 1}", r"among those that are admitted, got \[-6\.9"),
+        ("controls={lower: -1, upper: 1}", r"at the target within its limits, got \w+ .*= -6\.9\d+ of -1 to 1"),
         ("target=null target_control=[1]", "target with target_control, got none"),
     ],
 )

@@ -7,7 +7,7 @@ import torch
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import instance_of, section
-from lyapnet.experiment.assembly.entries import index_of
+from lyapnet.experiment.assembly.entries import by_state, index_of
 from lyapnet.experiment.config import ConstraintsConfig
 from lyapnet.task.constraints import CONSTRAINTS, AllOf, Ball, Constraints, OfFirstStates, StateLimits
 from lyapnet.task.domain import size_of
@@ -72,12 +72,11 @@ def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:
     """
     system, goal, box, columns = problem.system, problem.goal, problem.initial_states, []
     for key, side, given in (("lower", -1.0, config.lower), ("upper", 1.0, config.upper)):
-        for name, limit in given.items():
-            i = index_of(name, f"constraints.{key}", system)
+        for i, limit in by_state(given, f"constraints.{key}", system).items():
             reach = float(box.reach_from(torch.full_like(goal, limit))[i])
             far = (problem.has_goal and abs(limit - float(goal[i]))) or reach or 1.0
             sign, unit = "≤" if side > 0 else "≥", system.state_units[i]
-            columns.append((i, limit, side, far, f"{name} {sign} {limit:g} {unit}".strip()))
+            columns.append((i, limit, side, far, f"{system.state_names[i]} {sign} {limit:g} {unit}".strip()))
     return [StateLimits(*zip(*columns, strict=True))] if columns else []
 
 

@@ -4,7 +4,7 @@ import math
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import section
-from lyapnet.experiment.assembly.entries import index_of
+from lyapnet.experiment.assembly.entries import by_state
 from lyapnet.experiment.config import DomainConfig
 from lyapnet.task.domain import Border
 from lyapnet.task.problem import Problem
@@ -26,8 +26,8 @@ def in_domain(config: DomainConfig, problem: Problem) -> Problem:
 def _declared(side: str, config: DomainConfig, problem: Problem) -> list[Border]:
     """The declared borders of one side; X₀ has to be strictly inside."""
     box, borders = problem.initial_states, list[Border]()
-    for name, value in getattr(config, side).items():
-        i = index_of(name, f"domain.{side}", problem.system)
+    for i, value in by_state(getattr(config, side), f"domain.{side}", problem.system).items():
+        name = problem.system.state_names[i]
         if not math.isfinite(value):
             raise UsageError(f"Expected domain.{side}.{name} as a finite number, got {value}; leave it out.")
         end = float(getattr(box, side)[i])

@@ -1,12 +1,15 @@
 """Lists in a config: one number for each state or control, or one for all."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import torch
 
-from lyapnet.base.errors import UsageError
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.experiment.schema import joined
 from lyapnet.task.systems import ControlAffineSystem
+
+Value = TypeVar("Value")
 
 
 def rows(name: str, matrix: Any) -> Any:
@@ -45,12 +48,35 @@ def require_length(key: str, length: int, names: Sequence[str]) -> None:
 
 
 def index_of(name: str, key: str, system: ControlAffineSystem) -> int:
-    """The index of the state with a name.
+    """The index of the state with a name, in which _ stands for a space too.
 
     Raises:
         UsageError: there is no such state; names the key.
     """
-    if name not in system.state_names:
-        names = ", ".join(system.state_names)
-        raise UsageError(f"Expected {key} among {names}, got {name!r}; name states of the system.")
-    return list(system.state_names).index(name)
+    return index_among(name, key, system.state_names)
+
+
+def index_among(name: str, key: str, names: Sequence[str], advice: str = "name states of the system.") -> int:
+    """The index of a name among those of states or controls; see `index_of`."""
+    written = [joined(each) for each in names]
+    if joined(name) not in written:
+        hint = did_you_mean(name, names, advice)
+        raise UsageError(f"Expected {key} among {', '.join(names)}, got {name!r}; {hint}")
+    return list(names).index(name) if name in names else written.index(joined(name))
+
+
+def by_state(
+    given: Mapping[str, Value], key: str, system: ControlAffineSystem, advice: str = "name states of the system."
+) -> dict[int, Value]:
+    """Index ↦ value of entries by names of states.
+
+    Raises:
+        UsageError: a name is no state, or there are two for one; names the key.
+    """
+    found = dict[int, Value]()
+    for name, value in given.items():
+        i = index_among(name, key, system.state_names, advice)
+        if i in found:
+            raise UsageError(f"Expected {key} with one entry for {name}, got two; leave one of them out.")
+        found[i] = value
+    return found

@@ -8,7 +8,7 @@ import torch
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import DTYPES, check_parameters, class_of, float64_defaults, section
-from lyapnet.experiment.assembly.entries import entry_per_state
+from lyapnet.experiment.assembly.entries import entry_per_state, index_of
 from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import Program
 from lyapnet.loop.rollout import Rollout
@@ -173,14 +173,10 @@ def program_options(config: Config) -> dict[str, Any]:
 
 def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
     """The indices of the states on which V depends."""
-    names, ignored = list(system.state_names), config.network.ignored_states
-    if unknown := [name for name in ignored if name not in names]:
-        raise UsageError(
-            f"Expected network.ignored_states among {', '.join(names)}, got {unknown[0]!r}; name states of the system."
-        )
-    if len(set(ignored)) == len(names):
+    ignored = {index_of(name, "network.ignored_states", system) for name in config.network.ignored_states}
+    if len(ignored) == system.n:
         raise UsageError("Expected V to depend on a state, got all in network.ignored_states; leave some out.")
-    return [i for i, name in enumerate(names) if name not in ignored]
+    return [i for i in range(system.n) if i not in ignored]
 
 
 def _terminal_cost(problem: Problem, kept: list[int]) -> Cost:

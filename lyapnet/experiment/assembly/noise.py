@@ -2,7 +2,7 @@
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import section
-from lyapnet.experiment.assembly.entries import index_of
+from lyapnet.experiment.assembly.entries import by_state
 from lyapnet.experiment.config import Config
 from lyapnet.loop.rollout.expectations import MOST_SOURCES
 from lyapnet.task.noise import Noise, StateNoise
@@ -26,11 +26,11 @@ def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
     if system.noisy:
         return None
     strengths = [0.0] * system.n
-    for name, strength in config.noise.items():
-        i = index_of(name, "noise", system)
+    for i, strength in by_state(config.noise, "noise", system).items():
         if i in system.constants:
             raise UsageError(
-                f"Expected noise of states that move, got {name}, a parameter of the family; leave it out."
+                f"Expected noise of states that move, got {system.state_names[i]}, a parameter of the family; leave it "
+                "out."
             )
         strengths[i] = strength
     with section("noise"):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import section
-from lyapnet.experiment.assembly.entries import index_of, repeated, require_length
+from lyapnet.experiment.assembly.entries import by_state, index_among, index_of, repeated, require_length
 from lyapnet.experiment.config import OutputsConfig
 from lyapnet.loop.estimation.kalman import initial_deviation, least_drift
 from lyapnet.task.input_disturbances import with_input_disturbances
@@ -17,6 +17,7 @@ from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.systems import moving_states
 
 ASSUMED, DISTURBANCES = "outputs.process_noise", "outputs.input_disturbances"
+WALKING = "name states, or parameters of a family or of randomise."
 
 
 def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
@@ -35,8 +36,9 @@ def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
     with section("outputs"):
         if config.measure:
             states = [index_of(each, "outputs.measure", system) for each in config.measure]
-            if repeated_names := [each for k, each in enumerate(config.measure) if each in config.measure[:k]]:
-                raise UsageError(f"Expected outputs.measure with each state once, got {repeated_names[0]} twice.")
+            if repeated_states := [i for k, i in enumerate(states) if i in states[:k]]:
+                twice = system.state_names[repeated_states[0]]
+                raise UsageError(f"Expected outputs.measure with each state once, got {twice} twice.")
             noise = repeated(config.noise, len(states))
             require_length("outputs.noise", len(noise), config.measure)
             return MeasuredStates(system, states, noise)
@@ -59,13 +61,8 @@ def problem_of_estimator(config: OutputsConfig, problem: Problem) -> Problem:
     """
     if not config.input_disturbances:
         return problem
-    names = list(problem.system.control_names)
-    for name in config.input_disturbances:
-        if name not in names:
-            raise UsageError(
-                f"Expected {DISTURBANCES} among {', '.join(names)}, got {name!r}; name controls of the system."
-            )
-    controls = [names.index(name) for name in config.input_disturbances]
+    names = problem.system.control_names
+    controls = [index_among(name, DISTURBANCES, names, "name controls.") for name in config.input_disturbances]
     root = math.sqrt(problem.horizon.duration)
     return with_input_disturbances(problem, controls, [root * drift for drift in config.input_disturbances.values()])
 
@@ -83,8 +80,8 @@ def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
     """
     least = least_drift(problem)
     drift = torch.zeros_like(least) if config.process_noise or problem.noise is not None else least
-    for name, strength in config.process_noise.items():
-        drift[index_of(name, ASSUMED, problem.system)] = strength
+    for i, strength in by_state(config.process_noise, ASSUMED, problem.system, WALKING).items():
+        drift[i] = strength
     if config.input_disturbances:
         drift[-len(config.input_disturbances) :] = drift.new_tensor([*config.input_disturbances.values()])
     return drift

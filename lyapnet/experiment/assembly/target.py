@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.experiment.assembly.entries import repeated, require_length
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly.entries import by_state, repeated, require_length
 from lyapnet.experiment.config import Config, ConstraintsConfig
+from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import Cost, TargetCost
 from lyapnet.task.operating_points import OperatingPoint, OperatingPoints
 from lyapnet.task.sets import Box, ControlSet
@@ -48,7 +49,7 @@ def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")
     x, u = _written_target(config, system), _written_control(config, system)
     if not bool(controls.contains(u)):
-        raise _not_admitted_error(u)
+        raise _not_admitted_error(system, controls, u)
     return TargetCost(cost, x, u)
 
 
@@ -64,8 +65,8 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         point = search.held_by(torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64))
         if not point.held:
             point, note = _move_to_nearest(search, given, point)
-            return Trim(_require_admitted(point), [], note)
-        return Trim(_require_admitted(point), [], "")
+            return Trim(_require_admitted(search, point), [], note)
+        return Trim(_require_admitted(search, point), [], "")
     points = search.find(given)
     if not points:
         raise UsageError(
@@ -75,7 +76,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
     point, *others = points
     if not point.held:
         point, note = _move_to_nearest(search, given, point)
-        return Trim(_require_admitted(point), [], note)
+        return Trim(_require_admitted(search, point), [], note)
     note = f"{_format_entries(given, system)}; solved for {_format_point(point, system, given)}"
     if others:
         further = "; ".join(
@@ -84,7 +85,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
         )
         more = f" and {len(others) - LISTED_POINTS} more" if len(others) > LISTED_POINTS else ""
         note += f", the nearest to X₀'s centre of {len(points)}; also {further}{more}"
-    return Trim(_require_admitted(point), others, f"target: {note}.")
+    return Trim(_require_admitted(search, point), others, f"target: {note}.")
 
 
 def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
@@ -104,22 +105,15 @@ def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
         named = dict(zip(system.state_names, entries, strict=True))
     else:
         named = dict(target)
-    known = {name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
     found = dict[int, float]()
-    for name, number in named.items():
-        key = str(name).replace(" ", "_")
-        if key not in known:
-            names = ", ".join(system.state_names)
-            hint = did_you_mean(str(name), system.state_names, "name states of the system.")
-            raise UsageError(f"Expected target of the states {names}, got {name!r}; {hint}")
-        if known[key] in found:
-            raise UsageError(f"Expected target with one number for {name}, got two; leave one of them out.")
+    for i, number in by_state({str(name): number for name, number in named.items()}, "target", system).items():
+        name = system.state_names[i]
         if type(number) not in (int, float) or not math.isfinite(number):
             raise UsageError(
                 f"Expected target of finite numbers, got {number!r} for {name}; correct it, or leave it out of a "
                 f"mapping as in {{{system.state_names[0]}: 1}}, and it is solved for."
             )
-        found[known[key]] = float(number)
+        found[i] = float(number)
     if not found:
         raise UsageError(f"Expected target with a state, got none; name one of {', '.join(system.state_names)}.")
     return found
@@ -178,24 +172,29 @@ def not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> Usage
     )
 
 
-def _require_admitted(point: OperatingPoint) -> OperatingPoint:
+def _require_admitted(search: OperatingPoints, point: OperatingPoint) -> OperatingPoint:
     if not point.admitted:
-        raise _not_admitted_error(point.u)
+        raise _not_admitted_error(search.system, search.controls, point.u)
     return point
 
 
-def _not_admitted_error(u: Tensor) -> UsageError:
+def _not_admitted_error(system: ControlAffineSystem, controls: ControlSet, u: Tensor) -> UsageError:
+    got = [f"{label} = {value:.4g}" for label, value in zip(system.control_labels, u.tolist(), strict=True)]
+    if controls.limits is not None:
+        low, high = (side.expand(system.m).tolist() for side in controls.limits)
+        got = [f"{each} of {a:g} to {b:g}" for each, a, b in zip(got, low, high, strict=True)]
     return UsageError(
-        f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
-        "choose another target."
+        f"Expected the control at the target within its limits, got {', '.join(got)}; widen controls, or choose "
+        "another target."
     )
 
 
 def state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
     """The state limits of a config, within which points are preferred; their names are checked elsewhere."""
     low, high = (
-        torch.tensor([float(side.get(name, none)) for name in system.state_names], dtype=torch.float64)
+        torch.tensor([float(named.get(joined(name), none)) for name in system.state_names], dtype=torch.float64)
         for side, none in ((config.lower, -math.inf), (config.upper, math.inf))
+        for named in ({joined(name): limit for name, limit in side.items()},)
     )
     return low, high
 

@@ -388,8 +388,8 @@ def require_one_for_each(noise: Sequence[float] | None, measure: Sequence[str]) 
     if noise is not None and len(noise) == 1 < len(measure):
         listed = ", ".join(measure)
         raise UsageError(
-            f"Expected outputs.noise with {len(measure)} entries ({listed}), got {list(map(float, noise))}; give one for "
-            "each, or a number without brackets for all."
+            f"Expected outputs.noise with {len(measure)} entries ({listed}), got {list(map(float, noise))}; give one "
+            "for each, or a number without brackets for all."
         )
 
 

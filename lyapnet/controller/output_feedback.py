@@ -55,6 +55,7 @@ class OutputFeedback:
     filter: KalmanFilter
     state_of_law: State  # a state that its law takes: its length, precision and device
     settings: dict[str, int]  # those of a family: name ↦ index of the state
+    ranged: list[int]  # the states that are parameters p, whose estimates stay in their ranges
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
@@ -70,6 +71,8 @@ class OutputFeedback:
         self._disturbed = problem.system.disturbed if isinstance(problem.system, DisturbedSystem) else []
         names = problem.system.state_names
         self.settings = {names[i].removeprefix(LOGARITHM): i for i in problem.system.settings}
+        of_plant = list(problem.system.constants)[: len(problem.system.constants) - len(self._disturbed)]
+        self.ranged = [i for i in of_plant if i not in problem.system.settings]
         self.filter = FILTERS[kind](self.problem, outputs, drift)
         self.reset()
 
@@ -148,6 +151,17 @@ class OutputFeedback:
 
     def _disturbances(self, x: State) -> Tensor:
         return x[..., self.problem.system.n - len(self._disturbed) :]
+
+    @property
+    def at_range_end(self) -> list[str]:
+        """Names of the parameters whose estimate is at an end of its range, in any loop of the batch.
+
+        The plant may then be beyond what V was trained for, and an offset may stay.
+        """
+        lower, upper = self._ends
+        p = self._belief.x.reshape(-1, self.problem.system.n)[:, self.ranged]
+        found = (((p <= lower) | (p >= upper)).any(0) & (lower < upper)).tolist()
+        return [self.problem.system.state_names[i] for i, ends in zip(self.ranged, found, strict=True) if ends]
 
     @property
     def P(self) -> Any:
@@ -255,14 +269,16 @@ class OutputFeedback:
 
     def _with_parameters_in_range(self, belief: Belief) -> Belief:
         """The belief with estimates of parameters p moved into their ranges, beyond which f and V may be undefined."""
-        system, box = self.problem.system, self.problem.initial_states
-        of_plant = list(system.constants)[: len(system.constants) - len(self._disturbed)]
-        parameters = [i for i in of_plant if i not in system.settings]
-        if not parameters:
+        if not self.ranged:
             return belief
-        x = belief.x.clone()
-        x[..., parameters] = x[..., parameters].clamp(box.lower[parameters], box.upper[parameters])
+        x, (lower, upper) = belief.x.clone(), self._ends
+        x[..., self.ranged] = x[..., self.ranged].clamp(lower, upper)
         return belief._replace(x=x)
+
+    @property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        box = self.problem.initial_states
+        return box.lower[self.ranged], box.upper[self.ranged]
 
     def _first_of(self, batch: tuple[int, ...]) -> Belief:
         """The first estimate of each loop of a batch."""

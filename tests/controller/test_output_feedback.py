@@ -205,6 +205,20 @@ def test_estimated_parameters_stay_in_their_ranges():
     assert feedback.x_hat[:, 2].max() == 1.5
 
 
+def test_estimates_at_an_end_of_a_range_are_named():
+    """A pendulum of 3 m while 0.5 to 1.5 m are known; one of 1 m is in the middle."""
+    config = {"randomise": {"length": [0.5, 1.5], "mass": [1, 1]}, "horizon": {"steps": 100, "dt": 0.02}}
+    for length, expected in ((3.0, ["length"]), (1.0, [])):
+        feedback = controller_of(**config, controls={}).with_estimator()
+        assert feedback.at_range_end == []
+        plant, x = feedback.problem, torch.tensor([[0.5, 0.0, length, 1.0], [0.5, 0.0, 1.0, 1.0]]).double()
+        for _ in range(60):
+            u = feedback.step(x[:, :1])
+            x = plant.step(x, u.double())[0]
+        assert feedback.at_range_end == expected, "in any loop of the batch"
+    assert controller_of().with_estimator().at_range_end == []
+
+
 SETPOINTS = {"family": {"target_angle": [-0.5, 0.5]}, "controls": {"lower": -20, "upper": 20}}
 
 

@@ -79,6 +79,10 @@ class Bits:
     OUTSIDE_X0 = 4, "x is outside of X0 at t <= 0; of a loop by more than three standard deviations"
     OUTSIDE_DOMAIN = 8, "x is where f, g or the cost are not defined"
     MISSING = 16, "a reading is not finite, and was left out"
+    AT_RANGE_END = 32, "the estimate of a parameter is at an end of its range: the plant may be beyond, with an offset"
+
+
+LOOPS = ("MISSING", "AT_RANGE_END")  # what only a loop with an estimator returns
 
 
 def file_comment(facts: Mapping[str, str]) -> str:
@@ -220,7 +224,7 @@ def _header(controller: Controller, law: Law, style: Style, loop: Any) -> str:
     if (limits := limits_of(controller, style)) is not None and all(bool(side.isfinite().all()) for side in limits):
         numbers |= {"U_LOWER": numbers_of(limits[0]), "U_UPPER": numbers_of(limits[1])}
     defines = "".join(f"#define {macro}_{key} {text}\n" for key, text in (sizes | numbers).items())
-    bits = {key: entry for key, entry in vars(Bits).items() if key.isupper() and (loop is not None or key != "MISSING")}
+    bits = {key: entry for key, entry in vars(Bits).items() if key.isupper() and (loop is not None or key not in LOOPS)}
     codes = "".join(f"#define {macro}_{key} {number}  /* {what} */\n" for key, (number, what) in bits.items())
     control, value = signatures(law, style)
     return (

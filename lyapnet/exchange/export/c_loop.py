@@ -134,6 +134,9 @@ class LoopTraces:
             tables.append(box_table("domain_of_estimates", *domain.narrowed(-SLACK)))
             size = len(domain.lower)  # further estimates, of what the law is not told, have none
             checks.append(f"if (!is_inside({size}, loop->x, domain_of_estimates)) code |= {macro}_OUTSIDE_DOMAIN;")
+        if estimated := [i for i in loop.ranged if box.widths[i] > 0]:
+            tables.append(box_table("ends", box.lower[estimated], box.upper[estimated]))
+            checks.append(ENDS.replace("@K", str(len(estimated))).replace("@WHICH", ", ".join(map(str, estimated))))
         which = list(loop.settings.values())
         change = CHANGE.replace("@K", str(len(which))).replace("@WHICH", ", ".join(map(str, which)))
         if which:
@@ -227,6 +230,9 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
 """
 
 
+ENDS = """static const int ranged[@K] = {@WHICH};
+    for (int i = 0; i < @K; i++)
+        if (loop->x[ranged[i]] <= ends[i][0] || loop->x[ranged[i]] >= ends[i][1]) code |= @MACRO_AT_RANGE_END;"""
 CHANGE = """    static const int which[@K] = {@WHICH};
     for (int i = 0; i < @K; i++) {
         if (isnan(r[i]) || (r[i] <= loop->x[which[i]] && r[i] >= loop->x[which[i]])) continue;

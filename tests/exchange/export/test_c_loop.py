@@ -191,6 +191,25 @@ def test_readings_that_are_none_and_failures_are_told(tmp_path):
     assert np.isfinite(x_hat).all()
 
 
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_loop_says_while_a_parameter_is_at_an_end_of_its_range(dtype, tmp_path):
+    """A plant of 3 m where 0.5 to 1.5 m are known; the code is there at the steps at which Python's name is."""
+    loop = controller_of(randomise={"length": [0.5, 1.5]}, **SWING).with_estimator()
+    found, bit, told = compiled_loop(loop, tmp_path / "loop", dtype), Bits.AT_RANGE_END[0], list[bool]()
+    x = torch.tensor([0.5, 0.0, 3.0]).double()
+    for _ in range(40):
+        u = loop.step(x[:1].numpy())
+        found.step(x[:1].numpy())
+        told.append(bool(found.code & bit))
+        assert told[-1] == (loop.at_range_end == ["length"])
+        x = loop.problem.step(x, torch.from_numpy(u).double())[0]
+    assert told[-1]
+    assert not told[0]
+    fixed = controller_of(**SWING).with_estimator()
+    export(fixed, tmp_path / "fixed", "c")
+    assert "code |= LYAPNET_AT_RANGE_END" not in (tmp_path / "fixed" / "policy.c").read_text()
+
+
 @pytest.mark.gate
 def test_a_loop_says_where_its_estimate_is_outside_of_the_domain(tmp_path):
     found = compiled_loop(LOOPS["a domain"](), tmp_path / "loop")

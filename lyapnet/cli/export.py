@@ -53,6 +53,10 @@ def export(
     if beyond is None:
         quiet = "" if controller.problem.noise is None else "; these closed loops are without noise"
         notes.print(f"law: {controller.after_horizon()}{quiet}", soft_wrap=True)
+    if exported is controller and controller.measures_outputs and to in ("c", "fmu"):
+        notes.print(
+            "note: the law alone, of the state; --estimator ekf adds the loop from its readings", soft_wrap=True
+        )
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)

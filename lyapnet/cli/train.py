@@ -74,6 +74,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
     kind = _claim(plan.config) if plan.module.members[0].problem.has_goal else "tube"
     modules = ", ".join(["lyapnet", *dict.fromkeys(name.partition(":")[0] for name in own.values())])
     arguments = "".join(f", {part}={python_of(plan.config, part)}" for part in own)
+    estimator = " --estimator ekf" if plan.config.outputs.noise is not None else ""
     path = json.dumps(str(best), ensure_ascii=False)
     for what, shown in (
         ("run", plan.run.folder),
@@ -81,7 +82,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         ("measure", f"lyapnet evaluate {quoted}{options}"),
         ("animate", f"lyapnet animate {quoted}{options} --out closed_loops.gif"),
         ("certify", f"lyapnet certify {kind} {quoted}{options}"),
-        ("export", f"lyapnet export {quoted}{options} --to c --out law"),
+        ("export", f"lyapnet export {quoted}{options} --to c --out law{estimator}"),
         ("fine-tune", f"{command} --finetune {quoted}"),
         ("use", f"import {modules}; controller = lyapnet.load({path}{arguments})"),
     ):

@@ -30,6 +30,7 @@ from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 PATHS = 32  # paths of the noise from each state
+NOT_ASKED = "The optimum was not asked for"
 TOO_MUCH_SPREAD = "log E exp(θJ)/θ is not measured, as too few of these paths count in it; costs are E J"
 CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
@@ -220,7 +221,7 @@ def _evaluation_on_model(
     later = share_at_goal(controller, first.x0[:LOOPS]), controller.law.beyond
     further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0), *later)
     if not optimum:
-        return Evaluation(first, paper, ["not asked for"] * samples, *further)
+        return Evaluation(first, paper, [NOT_ASKED] * samples, *further)
     try:
         oracle = oracle_of(problem, controller.method)
         optima = oracle.solve(first.x0, trajectory.u[:, :samples], progress)  # the controller's u are initial guesses
@@ -252,7 +253,7 @@ def _evaluation_under_noise(
         except OracleError as reason:
             notes = [str(reason)] * samples
     else:
-        notes = ["not asked for"] * samples
+        notes = [NOT_ASKED] * samples
     return Evaluation(first, paper, notes, *further, about, noise)
 
 

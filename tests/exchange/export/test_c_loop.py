@@ -22,7 +22,7 @@ from lyapnet.task.systems import ControlAffineSystem, Pendulum
 from lyapnet.value.expansions import riccati
 from tests.marks import sample
 from tests.problems import OfExpansion
-from tests.runs import tiny_checkpoint
+from tests.runs import TINY, tiny_checkpoint
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -319,6 +319,28 @@ def test_a_plant_in_c_is_led_as_in_python(tmp_path):
         u = loop.step(x[:1])
         x = controller.problem.step(x, u)[0]
     assert [float(each) for each in printed] == pytest.approx(x.tolist(), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_training_prints_the_export_of_what_reads_its_outputs(measured, tmp_path, capsys):
+    overrides = [
+        *TINY,
+        "network.hidden=[8]",
+        "rollout.gradient=backprop",
+        f"logs={tmp_path / 'logs'}",
+        "experiment=tiny",
+    ]
+    overrides += ["outputs={measure: [position], noise: 0.01}"] if measured else []
+    assert main(["train", "--config", "conf/from_scratch/double_integrator.yaml", *overrides]) == 0
+    (line,) = [each for each in capsys.readouterr().out.splitlines() if each.startswith("export ")]
+    assert line.endswith("--to c --out law --estimator ekf") == measured
+    checkpoint = tmp_path / "logs" / "tiny" / "version_0" / "checkpoints" / "best.ckpt"
+    given = ["export", str(checkpoint), "--to", "c", "--out", str(tmp_path / "law")]
+    assert main(given) == 0
+    assert ("note: the law alone, of the state; --estimator ekf" in capsys.readouterr().out) == measured
+    if measured:
+        assert main([*given, "--estimator", "ekf"]) == 0
+        assert "note: the law alone" not in capsys.readouterr().out
 
 
 @pytest.mark.gate

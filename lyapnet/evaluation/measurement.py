@@ -61,6 +61,7 @@ class Evaluation(NamedTuple):
     noise: NoiseMeasures | None = None  # with noise; costs are then expectations
     plants: OnPlants | None = None  # with random plants; all other measures are those on the model
     estimated: EstimatorMeasures | None = None  # with outputs; all other measures are those with the state known
+    program: str = ""  # name of the class by which V was trained
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -90,6 +91,7 @@ class Evaluation(NamedTuple):
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
+            "program": self.program,
             "worst_corner": self.corner._asdict(),
         }
 
@@ -194,16 +196,16 @@ def evaluation(
     x0 = controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST))
     if estimator is None and controller.measures_outputs:
         estimator = controller.with_estimator()
-    estimated = None
+    estimated, program = None, type(controller.program).__name__
     if estimator is not None:
         estimated = measure_with_estimator(loops_with_estimator(controller, estimator, x0[:samples], seed), estimator)
     if controller.problem.noise is not None:
         under_noise = _evaluation_under_noise(controller, x0, samples, seed, optimum, progress, paths)
-        return under_noise._replace(estimated=estimated)
+        return under_noise._replace(estimated=estimated, program=program)
     plants = controller.plants
     on_plants = None if plants is None else measure_on_plants(plants, x0[:samples], seed, optimum, progress)
     on_model = _evaluation_on_model(controller, x0, samples, seed, optimum, progress)
-    return on_model._replace(plants=on_plants, estimated=estimated)
+    return on_model._replace(plants=on_plants, estimated=estimated, program=program)
 
 
 def _evaluation_on_model(

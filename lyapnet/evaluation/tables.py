@@ -7,6 +7,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from lyapnet.base.tables import DIVERGED, ratio
+from lyapnet.loop.programs import ValueProgram
 from lyapnet.value.after_horizon import HELD
 
 REGRET = "regret, mean (cost − optimum) / spread of the optimum"
@@ -33,6 +34,7 @@ ROWS = {
     "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
     "satisfied_fraction_1e-3": "… within 0.1 %",
 }
+BOUNDS = ("bounded_fraction", "satisfied_fraction", "satisfied_fraction_1e-3")  # which a value program does not ask for
 REFERENCES = ("held", "lqr")  # reference costs, shown as a ratio if the optimum is known
 WITHOUT_NOISE = "closed loops without the task's noise"
 LEFT_DOMAIN = "left_domain_fraction"
@@ -182,6 +184,8 @@ def _rows(result: dict[str, Any]) -> dict[str, str]:
     unknown = ("cost_mean",) if known else ("cost_ratio", "regret")
     left_out = {f"{name}_{key}" for name in REFERENCES for key in unknown}
     labels = {**ROWS, **SHARES_IF_PRESENT}
+    if result.get("program") == ValueProgram.__name__:
+        left_out.update(BOUNDS)
     if "regret" in result:
         left_out.add("cost_ratio")
         labels["value_error"] = "value error, mean |V(0, x₀) − J*| / spread of J*"

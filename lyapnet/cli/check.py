@@ -21,7 +21,7 @@ from lyapnet.cli.options import Debug
 NAMES = 14  # columns for the names of facts
 WIDEST = 120
 # names of facts in the order in which they become known
-ORDER = ("horizon", "X₀", "system", "goal", "modes", "controllable", "stiffness", "start")
+ORDER = ("horizon", "X₀", "system", "goal", "modes", "controllable", "step gain", "start")
 
 
 def check(

@@ -378,8 +378,9 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
 
 def _require_noise_of_each(content: Mapping[str, Any], overrides: Sequence[str], outputs: OutputsConfig) -> None:
     """Require a list outputs.noise to have one entry for each reading; only a number written as such is for all."""
-    layers = OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))
-    written = OmegaConf.select(OmegaConf.merge(*layers), "outputs.noise")
+    written = None
+    for layer in (OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))):
+        written = OmegaConf.select(layer, "outputs.noise", default=written)
     require_one_for_each(written if OmegaConf.is_list(written) else None, outputs.measure)
 
 

@@ -23,7 +23,7 @@ def facts_of_config(config: Config) -> list[Fact]:
     end = ", and on: without end" if horizon.stationary else ""
     return [
         Fact("horizon", f"T = {horizon.steps * horizon.dt:g} s in {steps} of {horizon.dt:g} s{end}"),
-        Fact("X₀", f"between {format_numbers(box.lower)} and {format_numbers(box.upper)}"),
+        Fact("X₀", between(box.lower, box.upper)),
         *_outputs_facts(config.outputs),
     ]
 
@@ -37,6 +37,13 @@ def _outputs_facts(outputs: OutputsConfig) -> list[Fact]:
         return [Fact(OUTPUTS, f"output(x) of the system ± {format_numbers(outputs.noise)}")]
     read = (f"{name} ± {each:.3g}" for name, each in zip(outputs.measure, noise, strict=False))
     return [Fact(OUTPUTS, ", ".join(read))]
+
+
+def between(lower: Sequence[float], upper: Sequence[float]) -> str:
+    """Describe a box; one number on both sides is that of each state."""
+    if len(lower) == len(upper) == 1:
+        return f"each state between {lower[0]:.3g} and {upper[0]:.3g}"
+    return f"between {format_numbers(lower)} and {format_numbers(upper)}"
 
 
 def format_numbers(numbers: Sequence[float]) -> str:

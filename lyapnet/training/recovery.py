@@ -22,7 +22,7 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.loggers import drop_logs_after
 from lyapnet.training.plan import Plan
 from lyapnet.training.start import Start
-from lyapnet.training.task_facts import stiffness
+from lyapnet.training.task_facts import step_gain
 from lyapnet.value.expansions import in_float64
 from lyapnet.value.policy import HJBPolicy
 
@@ -148,9 +148,9 @@ class Returns:
         """Describe what is wrong with the law or the initial V, in a sentence; empty if nothing is known."""
         member: Learner = self.plan.module.members[0]
         if isinstance(member.rollout.closed_loop.policy, HJBPolicy):
-            stiff = stiffness(in_float64(member.problem))
-            if stiff.advice:
-                return f" The law is too stiff: {stiff.found}; take {stiff.advice}."
+            gain = step_gain(in_float64(member.problem))
+            if gain.advice:
+                return f" The steps are too long for the law: {gain.found}; take {gain.advice}."
         if self.start is not None and self.start.chosen.finite < 1:
             known = f"{self.start.chosen.finite:.0%}"
             return f" The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."

@@ -1,4 +1,4 @@
-"""Facts about a problem before training: its goal, its linearisation there, its stiffness, the initial V."""
+"""Facts about a problem before training: its goal, its linearisation there, the gain of a step, the initial V."""
 
 import math
 from collections import Counter
@@ -42,6 +42,8 @@ from lyapnet.value.linearisation import (
     smoothed_part,
 )
 
+NAMED_CONTROLS = 4  # largest number of controls whose limits are told by name
+STEP_GAIN = "step gain"  # name of a fact
 STABLE_GAIN = 2.0  # largest gain Δt λ of the HJB law for which Euler steps do not oscillate and grow
 REACHABILITY_TOLERANCE = 1e-10  # relative to A in scaled units: larger entries count as coupling of two states
 EIGENVALUE_TOLERANCE = 1e-8  # relative to the largest eigenvalue or A: smaller real and imaginary parts count as zero
@@ -88,10 +90,10 @@ def facts_of(
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
             tell(_goal_fact(exact, around, problem.goal.dtype), *_mode_facts(exact, around))
-            stiff = stiffness(exact, learner.rollout)
-            if around.missing is not None and around.missing.reason in stiff.found:
-                stiff = Fact("stiffness", "unknown, for the reason above")
-            tell(stiff)
+            gain = step_gain(exact, learner.rollout)
+            if around.missing is not None and around.missing.reason in gain.found:
+                gain = Fact(STEP_GAIN, "unknown, for the reason above")
+            tell(gain)
     try:
         if isinstance(problem.cost, PenaltyCost):
             relaxation = find_penalty_weight(problem, report)
@@ -235,9 +237,14 @@ def _system_fact(problem: Problem) -> Fact:
     system, controls = problem.system, problem.controls
     limits = ""
     if controls.limited:
-        box = controls.limits if controls.is_box else None
-        sides = None if box is None else [_format_vector(side.expand(system.m)) for side in box]
-        limits = f" in {controls}" if sides is None else f" between {sides[0]} and {sides[1]}"
+        limits = f" in {controls}"
+        if controls.limits is not None and controls.is_box:
+            low, high = (side.expand(system.m) for side in controls.limits)
+            rows = zip(system.control_names, system.control_units, low.tolist(), high.tolist(), strict=True)
+            limits = f" between {_format_vector(low)} and {_format_vector(high)}"
+            if system.m <= NAMED_CONTROLS:
+                named = [f"{name} between {a:.3g} and {b:.3g} {unit}".rstrip() for name, unit, a, b in rows]
+                limits = ": " + ", ".join(named)
     return Fact(
         "system",
         f"{system.title}: {_format_count(system.n, 'state')}, {_format_count(system.m, 'control')}{limits}",
@@ -294,7 +301,7 @@ def _mode_facts(problem: Problem, around: Linearisation) -> list[Fact]:
     A, B, dt = around.A[moving][:, moving], around.g[moving], problem.horizon.dt
     extent = problem.initial_states.reach_from(problem.goal)[moving]
     values = torch.linalg.eigvals(A)
-    facts = [Fact("modes", f"{_format_modes(values)} 1/s at the goal")]
+    facts = [Fact("modes", f"{_format_modes(values)} 1/s at the goal, without feedback")]
     unreached = unreached_modes(A, B, extent.where(extent > 0, 1))
     if not len(unreached):
         facts.append(Fact("controllable", "yes, linearised at the goal"))
@@ -341,24 +348,26 @@ def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
     return _drop_rounding(torch.linalg.eigvals(A), size)
 
 
-def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
+def step_gain(problem: Problem, rollout: Rollout | None = None) -> Fact:
     """The gain of the HJB law over one step, Δt λ_max(R⁻¹gᵀHg)/2 at the goal, with H from the Riccati solution."""
     at_goal = riccati_or_reason(problem)
     if isinstance(at_goal, Missing):
-        return Fact("stiffness", f"unknown: {at_goal.reason}; {at_goal.remedy}")
+        return Fact(STEP_GAIN, f"unknown: {at_goal.reason}; {at_goal.remedy}")
     g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
     weighted = torch.linalg.solve(R, g.mT @ at_goal.hessian @ g)
     if not weighted.isfinite().all():
-        return Fact("stiffness", "unknown: R⁻¹gᵀV_xx g is not finite at the goal; give every control a weight in R")
+        return Fact(STEP_GAIN, "unknown: R⁻¹gᵀV_xx g is not finite at the goal; give every control a weight in R")
     gain = problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max())
     found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
     if gain <= STABLE_GAIN:
-        return Fact("stiffness", f"{found}: every control law is stable at this Δt")
-    found = f"{found} > {STABLE_GAIN:g}: rollout.policy=hjb is unstable at this Δt"
+        return Fact(STEP_GAIN, f"every control law is stable at this Δt: {found}")
+    found = f"{found} > {STABLE_GAIN:g}"
     if rollout is not None and rollout.closed_loop.policy.held:
-        return Fact("stiffness", f"{found}; the law that this config has is made to be held for Δt, and is stable")
+        law = "the law that this config has is stable, made to be held for Δt"
+        return Fact(STEP_GAIN, f"{law}; rollout.policy=hjb would not be: {found}")
+    found = f"rollout.policy=hjb is unstable at this Δt: {found}"
     return Fact(
-        "stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE_GAIN / gain:.2g}"
+        STEP_GAIN, found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE_GAIN / gain:.2g}"
     )
 
 

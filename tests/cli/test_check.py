@@ -111,7 +111,7 @@ def test_check_names_what_outputs_do_not_tell(tmp_path, capsys):
 @pytest.mark.usefixtures("without_start")
 def test_modes_and_controllability():
     reached = facts(linear([[0, 1], [4, 0]], [[0], [1]]))
-    assert reached["modes"].found == "2, -2 1/s at the goal"
+    assert reached["modes"].found == "2, -2 1/s at the goal, without feedback"
     assert reached["controllable"].found.startswith("yes")
     lost = facts(linear([[0.5, 0], [0, -1]], [[0], [1]]))["controllable"]
     assert "does not reach 0.5" in lost.found
@@ -122,7 +122,7 @@ def test_modes_and_controllability():
 @pytest.mark.gate
 def test_limits_and_what_they_do_not_admit():
     task = linear([[0, 1], [0, 0]], [[0], [1]], controls={"lower": -1, "upper": 2})
-    assert "1 control between (-1) and (2)" in facts(task)["system"].found
+    assert "1 control: u1 between -1 and 2" in facts(task)["system"].found
     assert facts(task)["goal"].found == "an equilibrium without control"
     away = facts({**task, "controls": {"lower": 1, "upper": 2}})
     assert away["goal"].found == "u = (0) is beyond its limits"
@@ -154,20 +154,20 @@ def test_a_goal_that_is_no_equilibrium(B, words):
 
 @pytest.mark.usefixtures("without_start")
 @pytest.mark.gate
-def test_stiffness_is_that_at_which_the_hjb_law_breaks():
+def test_the_step_gain_is_that_at_which_the_hjb_law_breaks():
     """ẋ = u, φ = px²: the gain over a step is Δt p/R, and Euler steps of u = −px/R grow above 2."""
     stiff = linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [30]})
     for policy in ("hjb", "sontag"):
-        fact = facts({**stiff, "rollout": {"policy": policy}})["stiffness"]
+        fact = facts({**stiff, "rollout": {"policy": policy}})["step gain"]
         assert "= 3 > 2" in fact.found
         assert fact.advice == "rollout.policy=sampled, or horizon.dt ≤ 0.067"
     for policy in ("sampled", "lookahead"):
-        fact = facts({**stiff, "rollout": {"policy": policy}})["stiffness"]
+        fact = facts({**stiff, "rollout": {"policy": policy}})["step gain"]
         assert "= 3 > 2" in fact.found
-        assert "made to be held for Δt, and is stable" in fact.found
+        assert fact.found.startswith("the law that this config has is stable")
         assert not fact.advice
     assert (
-        "every control law" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["stiffness"].found
+        "every control law" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["step gain"].found
     )
 
 
@@ -230,6 +230,9 @@ def test_the_command(tmp_path, capsys):
     assert [fact["found"] for fact in report["facts"][:3]] == [
         "T = 0.5 s in 10 steps of 0.05 s", "between (-0.5, -0.5) and (0.5, 0.5)", "Pendulum: 2 states, 1 control",
     ]  # fmt: skip
+    both = ["initial_states.lower=-0.5", "initial_states.upper=0.5", "--json"]
+    assert main(["check", str(path), *both]) == 0
+    assert json.loads(capsys.readouterr().out)["facts"][1]["found"] == "each state between -0.5 and 0.5"
     assert report["facts"][-1]["found"] == "training starts from 12 optima from states of X₀"
     assert main(["check", str(path), "network.name=fcn", "--json"]) == 0
     assert "expansion" in json.loads(capsys.readouterr().out)["facts"][-1]["advice"]

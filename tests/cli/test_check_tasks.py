@@ -41,7 +41,7 @@ def facts_before_optima(config, parts=None):
     try:
         facts_of(learner, stop, told.append)
     except EnoughError:
-        assert told[-1].name in ("goal", "stiffness", "reference")
+        assert told[-1].name in ("goal", "step gain", "reference")
     return told
 
 
@@ -59,7 +59,7 @@ def test_every_config(path):
         return
     noise = ["noise"] if config.noise else []
     assert names[: 4 + len(noise)] == ["system", *noise, "goal", "modes", "controllable"]
-    assert "stiffness" in names
+    assert "step gain" in names
 
 
 class Own(lyapnet.ControlAffineSystem):
@@ -116,7 +116,7 @@ TASKS = {
     "root": (
         ROOT,
         {},
-        {"modes": "the rate of x1, by x1, x2", "stiffness": "for the reason above", "goal": "an equilib"},
+        {"modes": "the rate of x1, by x1, x2", "step gain": "for the reason above", "goal": "an equilib"},
     ),
     "norm": (NORM, {}, {"modes": "-1e-06, -1 1/s", "controllable": "yes"}),
     "stiff": (STIFF, {}, {"modes": "0, -1e+04", "Δt": "a decaying mode grow under Euler steps"}),
@@ -193,8 +193,8 @@ def test_an_interrupt_leaves_the_facts(tmp_path):
     assert process.returncode == 130
     lines = shown.splitlines()
     assert lines[0] == "long.yaml, before training"
-    assert [line.split()[0] for line in lines if not line.startswith(" ")][1:] == [
-        "horizon", "X₀", "system", "goal", "modes", "controllable", "stiffness", "start",
+    assert [line[:14].strip() for line in lines if not line.startswith(" ")][1:] == [
+        "horizon", "X₀", "system", "goal", "modes", "controllable", "step gain", "start",
     ]  # fmt: skip
     assert max(map(len, lines)) <= 80
     *stages, last = notes.splitlines()
@@ -213,7 +213,7 @@ def test_an_interrupt_leaves_one_json_object(tmp_path, capfd, monkeypatch):
     report = json.loads(shown.out)
     assert not report["complete"]
     assert report["not_reached"] == ["the best start"]
-    assert [fact["fact"] for fact in report["facts"]][-2:] == ["stiffness", "start"]
+    assert [fact["fact"] for fact in report["facts"]][-2:] == ["step gain", "start"]
     assert "Stopped after" in shown.err.splitlines()[-1]
 
 

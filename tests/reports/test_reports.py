@@ -34,11 +34,11 @@ FACTS = {
     "algae": {"goal": "none: φ is 0, of slope (0, 0, 0, 0, 0, -1)", "modes": None},
     "reach": {"goal": "none: φ is 0, of slope (-1, 0), at the goal (1, 0)", "modes": None},
     "jets": {"modes": "0 (6 times) 1/s", "controllable": "yes"},
-    "minimum_time": {"goal": "an equilibrium without control", "stiffness": "made to be held for Δt"},
+    "minimum_time": {"goal": "an equilibrium without control", "step gain": "made to be held for Δt"},
     "distance": {
         "kink": "q and φ have a kink at the goal: training smooths them, √(x² + ε²) − ε with ε = 0.0",
         "controllable": "yes",
-        "stiffness": "made to be held for Δt",
+        "step gain": "made to be held for Δt",
     },
     "friction": {"jumps": "Block.f(x) jumps by 11.8 where speed = 0 at system.py:"},
     "battery_scalar": {"system": "1 state,", "goal": "(0.9), an equilibrium without control"},

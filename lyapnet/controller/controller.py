@@ -313,7 +313,7 @@ class Controller:
         known = OutputsConfig() if self._config is None else self._config.outputs
         section = replace(known, **{key: value for key, value in given.items() if value is not None})
         check_values(section, "outputs.")
-        require_one_for_each(None if np.ndim(noise) == 0 else _listed(noise), section.measure)
+        require_one_for_each(None if noise is None or np.ndim(noise) == 0 else _listed(noise), section.measure)
         plants = self.plants
         problem = self.problem if plants is None else plants.problem
         if (parts := estimator_parts(section, copied(problem))) is None:

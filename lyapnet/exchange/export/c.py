@@ -115,10 +115,14 @@ def sources(
     if loop is not None:
         further, size = loop.functions(tables)
         bodies.append(further)
-        entries, stack = entries + loop.entries(style, tried), max(stack, size)
+        entries, stack = entries + loop.entries(style, tried, law), max(stack, size + sizes["control"])
     made = "\n".join([*bodies, entries])
     code = "\n".join(['#include "policy.h"\n\n#include <math.h>\n', *helpers(made), *tables.text, made])
-    sized = {**facts, "tables": f"{style.size * tables.count} bytes", "stack": f"{style.size * stack} bytes of arrays"}
+    sized = {
+        **facts,
+        "tables": f"{style.size * tables.count} bytes",
+        "stack": f"{style.size * stack} bytes of arrays, and what else a compiler's frames hold",
+    }
     return {
         "policy.h": file_comment(sized) + style.code(_header(controller, law, style, loop)),
         "policy.c": file_comment(sized) + style.code(code),

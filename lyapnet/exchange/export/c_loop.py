@@ -17,6 +17,7 @@ from lyapnet.base.errors import ExportError
 from lyapnet.base.random_streams import OUTPUTS, TEST, stream
 from lyapnet.controller.output_feedback import ROUNDING, OutputFeedback
 from lyapnet.exchange.export.c import Style, box_table, has_limits, numbers_of
+from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import AFTER, STATES, LoopAgreement, Points, tolerance_of
 from lyapnet.graphs.c_functions import c_function
 from lyapnet.graphs.c_text import Tables, literal
@@ -26,14 +27,15 @@ from lyapnet.task.domain import SLACK
 
 MISSING = 0.05  # share of the readings that are left out where the loop is compared
 ELSEWHERE = 0.05  # share of the steps at which the plant gets another control there
+EXAMPLES = 64  # states of X₀ of which one is the example
 TRUSTED = 3  # standard deviations of the first estimate by which it may be outside of X₀
 
 Traced = dict[str, tuple[str, GraphModule, dict[str, Tensor], list[str]]]
 
 
 class LoopTraces:
-    """The parts of an estimator's loop, traced: predict (x, P, u) ↦ (x', P'), correct (x, P, y) ↦ (x', P'), and the
-    law at the estimate, feedback (t, x) ↦ u with d̂ taken off.
+    """The parts of an estimator's loop, traced: predict (x, P, u) ↦ (x', P'), correct (x, P, y) ↦ (x', P'), and
+    take_off (u, x) ↦ u − d̂ within the limits for the law's u, where disturbances d are estimated.
 
     Args:
         loop: with a Kalman filter that has rules in C: ekf.
@@ -52,8 +54,7 @@ class LoopTraces:
         self.readings, self.estimated, self.controls = loop.outputs.count, problem.system.n, problem.system.m
         self.settings = len(loop.settings)
         x, P = loop.middle_estimate(), torch.diag(loop.deviation.square())
-        u, y, t = problem.rest.double(), loop.outputs(x), torch.zeros((), dtype=torch.float64)
-        law, like = loop.law, loop.state_of_law
+        u, y = problem.rest.double(), loop.outputs(x)
 
         def predict(x: Tensor, P: Tensor, u: Tensor) -> tuple[Tensor, ...]:
             return tuple(loop.filter.predict(Belief(x, P), u))
@@ -61,15 +62,15 @@ class LoopTraces:
         def correct(x: Tensor, P: Tensor, y: Tensor) -> tuple[Tensor, ...]:
             return tuple(loop.corrected(Belief(x, P), y))
 
-        def feedback(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
-            u = law.at_any_time(t.clamp(min=0).to(like), x[None, : len(like)].to(like))[0]
+        def take_off(u: Tensor, x: Tensor) -> tuple[Tensor, ...]:
             return (loop.without_disturbances(u, x),)
 
         self._parts: Traced = {
             "predict": self._traced(predict, {"x": x, "P": P, "u": u}, ["x_next", "P_next"]),
             "correct": self._traced(correct, {"x": x, "P": P, "y": y}, ["x_next", "P_next"]),
-            "feedback": self._traced(feedback, {"t": t, "x": x}, ["u"]),
         }  # fmt: skip
+        if loop.d_hat.shape[-1]:
+            self._parts["take_off"] = self._traced(take_off, {"u": u, "x": x}, ["u_next"])
 
     @staticmethod
     def _traced(
@@ -121,8 +122,8 @@ class LoopTraces:
             f"int {name}_applied({name}_loop *loop, const {real} u[{macro}_CONTROLS]);\n\n"
         )
 
-    def entries(self, style: Style, tried: Points) -> str:
-        """The loop's functions."""
+    def entries(self, style: Style, tried: Points, law: Law) -> str:
+        """The loop's functions; the law is that of `control_of`."""
         loop, problem = self.loop, self.loop.problem
         n, m, p, macro, name = self.estimated, self.controls, self.readings, style.macro, style.name
         box, domain, known = problem.initial_states, loop.controller.problem.domain, len(tried.lower)
@@ -144,6 +145,9 @@ class LoopTraces:
             tables.append(box_table("ranges", box.lower[which] - room, box.upper[which] + room))
         words = {
             "SETTINGS": change if which else "",
+            "LAW": ", ".join({"t": "&clock", "x": "loop->x", "p": f"loop->x + {len(law.arguments['x'])}"}[each]
+                             for each in law.arguments),
+            "OFF": TAKE_OFF if "take_off" in self._parts else "",
             "R": f"const double r[{len(which)}], " if which else "",
             "NAME": name, "MACRO": macro, "N": n, "M": m, "P": p, "KNOWN": known, "FIRST": ", ".join(members),
             "TRUSTED": literal(TRUSTED), "DT": problem.horizon.dt.hex(), "CHECKS": "\n    ".join(checks),
@@ -153,10 +157,9 @@ class LoopTraces:
         return "\n".join([*tables, fill(fill(LOOP))])
 
     def example(self, style: Style) -> str:
-        """A program that gives the loop the readings of its first estimate, for five steps."""
+        """A program that gives the loop the same readings for five steps."""
         name, macro, real = style.name, style.macro, style.real
-        centre = self.loop.problem.initial_states.center
-        y, settings = numbers_of(self.loop.outputs(centre)), "r, " if self.settings else ""
+        y, settings = numbers_of(self._example_readings(5)), "r, " if self.settings else ""
         r = numbers_of(torch.full((self.settings,), torch.nan))  # they stay as they are
         declared = f"    const {real} r[{macro}_SETTINGS] = {r};\n" if self.settings else ""
         return (
@@ -169,6 +172,19 @@ class LoopTraces:
             f'        for (int i = 0; i < {macro}_CONTROLS; i++) printf("u[%d] = %g\\n", i, u[i]);\n'
             '        if (code) printf("code %d\\n", code);\n    }\n    return 0;\n}\n'
         )
+
+    @torch.no_grad()
+    def _example_readings(self, steps: int) -> Tensor:
+        """Readings (p,) of a state of X₀ under which the most controls of some steps are within their limits."""
+        loop, problem = copy.copy(self.loop), self.loop.problem
+        loop.reset()
+        box = problem.initial_states
+        y = loop.outputs(torch.cat([box.center[None], box.sample(EXAMPLES, stream(0, TEST, OUTPUTS))]))
+        u = torch.stack([loop.step(y).double().cpu() for _ in range(steps)])
+        if problem.controls.limits is None:
+            return y[0]
+        low, high = (side.double().cpu() for side in problem.controls.limits)
+        return y[((u > low) & (u < high)).double().mean((0, 2)).argmax()]
 
 
 # Time is double in single precision too: if rounding moved the step at T, the law after T would begin a step later.
@@ -213,7 +229,8 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
     correct_of(loop->x, loop->P, known_y, x, P);
     code |= keep(loop, x, P);
 @SETTINGS    double clock = loop->begun > 0 ? (double)((WIDE)(k - loop->begun) * @DT) : loop->t;
-    feedback_of(&clock, loop->x, next);
+    control_of(@LAW, next);
+    @OFF
     @LIMIT
     if (is_finite(@M, next))
         for (int i = 0; i < @M; i++) loop->u[i] = next[i];
@@ -230,6 +247,9 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
 """
 
 
+TAKE_OFF = """double of_law[@M];
+    for (int i = 0; i < @M; i++) of_law[i] = next[i];
+    take_off_of(of_law, loop->x, next);"""
 ENDS = """static const int ranged[@K] = {@WHICH};
     for (int i = 0; i < @K; i++)
         if (loop->x[ranged[i]] <= ends[i][0] || loop->x[ranged[i]] >= ends[i][1]) code |= @MACRO_AT_RANGE_END;"""

@@ -321,6 +321,30 @@ def test_a_plant_in_c_is_led_as_in_python(tmp_path):
     assert [float(each) for each in printed] == pytest.approx(x.tolist(), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.parametrize(("limit", "inside"), [(0.7, True), (1e-6, False)])
+def test_the_example_prints_controls_within_their_limits_if_some_readings_lead_there(limit, inside, tmp_path):
+    """From the middle of X₀, 3 rad from the goal, the first control is at its limit."""
+    box = {"initial_states": {"lower": [-1, -1], "upper": [4, 1]}, "controls": {"lower": -limit, "upper": limit}}
+    export(controller_of(**box).with_estimator(), tmp_path / "loop", "c")
+    program = str(tmp_path / "main")
+    sources = [str(tmp_path / "loop" / name) for name in ("main.c", "policy.c")]
+    subprocess.run(["cc", "-std=c99", "-o", program, *sources, "-lm"], check=True)
+    printed = subprocess.run([program], capture_output=True, text=True, check=True).stdout
+    u = [abs(float(line.split(" = ")[1])) for line in printed.splitlines() if line.startswith("u[0]")]
+    assert (max(u) < limit) == inside
+
+
+def test_the_law_is_written_once(tmp_path):
+    """A loop calls the function of the law, and takes estimated disturbances off afterwards."""
+    for name in ("a pendulum", "a disturbance"):
+        export(LOOPS[name](), tmp_path / name, "c")
+        code = (tmp_path / name / "policy.c").read_text()
+        assert re.findall(r"^static void (\w+_of)\(", code, re.MULTILINE) == [
+            "control_of", "value_of", "predict_of", "correct_of", *["take_off_of"] * (name == "a disturbance"),
+        ]  # fmt: skip
+        assert code.count("control_of(") == 3, "its definition, lyapnet_control and lyapnet_step"
+
+
 @pytest.mark.parametrize("measured", [True, False])
 def test_a_training_prints_the_export_of_what_reads_its_outputs(measured, tmp_path, capsys):
     overrides = [

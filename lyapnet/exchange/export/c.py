@@ -121,7 +121,7 @@ def sources(
     sized = {
         **facts,
         "tables": f"{style.size * tables.count} bytes",
-        "stack": f"{style.size * stack} bytes of arrays, and what else a compiler's frames hold",
+        "stack": f"{style.size * stack} bytes of arrays; a compiler's frames add to that",
     }
     return {
         "policy.h": file_comment(sized) + style.code(_header(controller, law, style, loop)),

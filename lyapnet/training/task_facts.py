@@ -141,12 +141,12 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     if not vague and not walking:
         return [Fact(OBSERVABLE, f"yes; {known}")]
     if not vague:
-        listed = ", ".join(walking)
+        listed, walk = ", ".join(walking), "it walks" if len(walking) == 1 else "they walk"
         return [
             Fact(
                 OBSERVABLE,
-                f"no: at T more than half of the first uncertainty is left of {listed}, as it walks; {known}",
-                f"a smaller walk of {listed} in outputs, or readings that tell more of it",
+                f"no: at T more than half of the first uncertainty is left of {listed}, as {walk}; {known}",
+                f"a smaller walk of {listed}, or readings that tell more of it",
             )
         ]
     listed = ", ".join(vague)

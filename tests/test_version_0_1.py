@@ -50,6 +50,7 @@ def known_then(evaluation):
 LATER = (
     "worst_corner",
     "falling_fraction",
+    "program",
     "largest_rise",
     "held_cost",
     "lqr_cost",

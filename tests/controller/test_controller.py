@@ -232,7 +232,8 @@ def test_evaluation_has_the_designed_keys(controller):
     assert errors.keys() == {"position (m)", "velocity (m/s)"}
     assert result["optimum_of"] == "steps of 0.01 s (euler) with u held"
     assert result["after_T"] in LAWS
-    numbers = [value for key, value in result.items() if key not in ("optimum_of", "after_T")]
+    assert result["program"] == "LyapunovProgram"
+    numbers = [value for key, value in result.items() if key not in ("optimum_of", "after_T", "program")]
     assert all(isinstance(value, int | float) for value in (*numbers, *errors.values()))
     assert json.loads(json.dumps(result)) == result
 

@@ -306,8 +306,6 @@ class Own(lyapnet.Cost):
         ({"family": {"R_torque": [0.1, 2]}, "cost": {"Q": [1, 1], "R": "inverse_mass", "Q_T": [1, 1]}},
          "Expected cost.R in numbers for the weights R_torque of a family, got inverse_mass"),
         ({"family": {"Q_angle": [0.1, 2]}, "cost": {"name": f"{__name__}:Own"}}, "got a cost of your own"),
-        ({"family": {"Q_angle": [0.1, 2]}, "cost": {"Q": [1, 1], "R": 1},
-          "horizon": {"steps": 20, "dt": 0.05, "stationary": True}}, "Expected one system with horizon.stationary"),
     ],
 )  # fmt: skip
 def test_weights_that_are_none_are_refused(changes, expected):

@@ -10,6 +10,7 @@ from lyapnet.task.sets import ControlSet
 
 NEWTON_STEPS = 10  # for a multiplier: they converge from one side, and double its digits at each step
 TINY = 1e-100  # replaces 0 in denominators
+LEAST_NUMBER = 1e-12  # smallest weight or limit that is not taken for a mistake, and the inverse of the largest
 INWARDS = 8  # units of rounding by which projected controls are inside; they are projected from half of it on
 
 
@@ -27,9 +28,8 @@ class ControlBall(ControlSet):
 
     def __init__(self, radius: float):
         super().__init__()
-        if type(radius) not in (int, float) or not 1e-12 <= radius <= 1e12:
-            raise ValueError(f"Expected a radius > 0, got {radius!r}; give the largest ‖u‖.")
-        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.get_default_dtype()), persistent=False)
+        largest = torch.tensor(positive_number("radius", radius), dtype=torch.get_default_dtype())
+        self.register_buffer("radius", largest, persistent=False)
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
@@ -80,19 +80,15 @@ def minimise_in_ball(R: ControlMatrix, b: Control, radius: Tensor | None, weight
     size, largest = norm(b), 2 * R.abs().sum(-1).amax(-1)  # of b; at least the largest eigenvalue of 2R
     moves = size > (0.0 if weight is None else weight)
     b, size = torch.where(moves[..., None], b, 1.0), torch.where(moves, size, 1.0)
-    # (offset, slope) of the line in λ that 1/‖u‖ meets at each multiplier
-    lines = []
+    multiplier = torch.zeros_like(size)
     if weight is not None:
         w = weight.to(b)
-        lines.append((0.0, 1 / w.clamp_min(TINY), w * largest / (size - w).clamp_min(TINY * size)))
+        start = w * largest / (size - w).clamp_min(TINY * size)
+        multiplier = _multiplier(R, b, 0.0, 1 / w.clamp_min(TINY), start)
     if radius is not None:
         r = radius.to(b)
-        lines.append((1 / r, 0.0, (size / r - largest).clamp_min(0)))
-    u = multiplier = None
-    for offset, rise, start in lines:
-        found = _multiplier(R, b, offset, rise, start)
-        multiplier = found if multiplier is None else torch.maximum(multiplier, found)
-    u = -_shifted(R, b, 0.0 if multiplier is None else multiplier)[0]
+        multiplier = multiplier.maximum(_multiplier(R, b, 1 / r, 0.0, (size / r - largest).clamp_min(0)))
+    u = -_shifted(R, b, multiplier)[0]
     return torch.where(moves[..., None], u, 0.0).to(given)
 
 
@@ -116,10 +112,20 @@ def _newton_step(
     return (multiplier - (1 / size - offset - rise * multiplier) / slope).clamp_min(0)
 
 
-def _shifted(R: ControlMatrix, b: Control, multiplier: Tensor | float) -> tuple[Control, ControlMatrix]:
+def _shifted(R: ControlMatrix, b: Control, multiplier: Tensor) -> tuple[Control, ControlMatrix]:
     """(2R + λ)⁻¹b, and the inverse."""
     one = torch.eye(b.shape[-1]).to(b)
-    shift = multiplier[..., None, None] * one if isinstance(multiplier, Tensor) else multiplier * one
-    A = 2 * R + shift
+    A = 2 * R + multiplier[..., None, None] * one
     inverse = solve(A, one.expand(A.shape))
     return apply(inverse, b), inverse
+
+
+def positive_number(name: str, number: float) -> float:
+    """A number > 0 of a set or a cost of controls.
+
+    Raises:
+        ValueError: it is none, or so small or large that it is taken for a mistake.
+    """
+    if type(number) not in (int, float) or not LEAST_NUMBER <= number <= 1 / LEAST_NUMBER:
+        raise ValueError(f"Expected {name} > 0, got {number!r}; correct it.")
+    return float(number)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.contracts import differences, state_of
 from lyapnet.base.errors import UsageError, one_line
-from lyapnet.base.interpolation import Basis
+from lyapnet.base.interpolation import Basis, combine
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, PerState, State
 from lyapnet.graphs.tracing import trace
@@ -164,7 +164,7 @@ class InterpolatedTargets(Targets):
 
     def _from_center(self, p: Tensor) -> Tensor:
         """(x*, u*)(p) − (x*, u*)(p̄)."""
-        return torch.stack(self.basis(p), -1) @ self.coefficients
+        return combine(self.basis(p), self.coefficients)
 
     def shift(self, p: Tensor) -> State:
         return self._from_center(p)[..., : self.n]

@@ -14,6 +14,7 @@ from lyapnet.experiment.assembly.classes import Parts, section
 from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
 from lyapnet.experiment.assembly.weights import named, weighted_matrices, weights_among, weights_of, with_weights
 from lyapnet.experiment.config import Config
+from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import Cost, MadeOfAnother, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
 from lyapnet.task.problem import Problem
@@ -157,7 +158,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
 
 def _moved_states(names: Collection[str], system: ControlAffineSystem) -> dict[int, int]:
     """Index of a state ↦ index of the parameter target_STATE that is its target."""
-    known = {PREFIX + name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
+    known = {PREFIX + joined(name): i for i, name in enumerate(system.state_names)}
     moved = dict[int, int]()
     for k, name in enumerate(names):
         if not name.startswith(PREFIX):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.interpolation import Basis, ChebyshevProducts, FourierSeries
+from lyapnet.base.interpolation import Basis, ChebyshevProducts, FourierSeries, combine
 from lyapnet.base.linear_algebra import apply
 from lyapnet.experiment.assembly.entries import repeated, require_length
 from lyapnet.experiment.assembly.target import log_once
@@ -88,7 +88,7 @@ class _Curve:
 
     def at(self, tau: Tensor) -> Tensor:
         """y at times (*batch, 1)."""
-        return torch.stack(self.basis(tau), -1) @ self.coefficients
+        return combine(self.basis(tau), self.coefficients)
 
     def rate(self, tau: Tensor) -> Tensor:
         """ẏ."""

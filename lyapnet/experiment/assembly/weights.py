@@ -9,6 +9,7 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import repeated, rows
 from lyapnet.experiment.config import CostConfig
+from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import COSTS, MATRICES, Cost, DiagonalWeights, MadeOfAnother, QuadraticCost
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -53,7 +54,7 @@ def weights_of(system: ControlAffineSystem) -> dict[str, Weight]:
     """The weights of a quadratic cost by name: Q_STATE, R_CONTROL and Q_T_STATE, with _ for spaces."""
     entries = {matrix: system.control_names if matrix == "R" else system.state_names for matrix in MATRICES}
     return {
-        f"{matrix}_{entry.replace(' ', '_')}": Weight(matrix, i)
+        f"{matrix}_{joined(entry)}": Weight(matrix, i)
         for matrix, names in entries.items() for i, entry in enumerate(names)
     }  # fmt: skip
 

@@ -13,14 +13,13 @@ from torch import Tensor, nn
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, has_values, norm
 from lyapnet.base.types import Control, ControlMatrix, PerState
-from lyapnet.task.ball import ControlBall, minimise_in_ball
+from lyapnet.task.ball import LEAST_NUMBER, ControlBall, minimise_in_ball, positive_number
 from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
 NEWTON_STEPS = 12  # of the minimiser with smooth costs, in traces
 SCALAR_STEPS = 12  # for a single control
 SCALAR_STEPS_FROM_AFAR = 40  # where no slope of the smooth costs bounds it beforehand
 MOST_NEWTON_STEPS = 60  # where values tell when it has converged
-LEAST_WEIGHT = 1e-12  # smallest weight, limit or width that is not taken for a mistake, and the inverse of the largest
 LEAST_EXPONENT = 1.2  # closer to 1 rounding hides where the minimum is
 CONVERGED = 1e-14  # a change of u, relative to u, at which it has
 STEP_SIZES = (1.0, 0.5, 0.125, 0.0156, 0.001)  # of its line search
@@ -49,7 +48,7 @@ class SeparableCost(ControlCost, ABC):
         weight: w > 0, a number or one for each control; of absolute costs some may be 0.
     """
 
-    least_weight: ClassVar[float] = LEAST_WEIGHT
+    least_weight: ClassVar[float] = LEAST_NUMBER
 
     def __init__(self, weight: float | Sequence[float] | Tensor):
         super().__init__()
@@ -84,7 +83,7 @@ class SeparableCost(ControlCost, ABC):
 class AbsoluteCost(SeparableCost):
     """s(u) = Σ wᵢ|uᵢ|: fuel, or the energy of an actuator that pays for what it moves."""
 
-    least_weight = 0.0
+    least_weight: ClassVar[float] = 0.0
 
     def forward(self, u: Control) -> PerState:
         return (self.weight * u.abs()).sum(-1)
@@ -104,9 +103,11 @@ class PseudoHuberControlCost(SeparableCost):
         width: δ > 0, in the unit of the controls.
     """
 
+    width: float
+
     def __init__(self, weight: float | Sequence[float] | Tensor, width: float):
         super().__init__(weight)
-        self.width = _positive("width", width)
+        self.width = positive_number("width", width)
 
     def forward(self, u: Control) -> PerState:
         return (self.weight * u * u / (torch.sqrt(u * u + self.width**2) + self.width)).sum(-1)
@@ -130,9 +131,11 @@ class PowerCost(SeparableCost):
         exponent: p ≥ LEAST_EXPONENT.
     """
 
+    exponent: float
+
     def __init__(self, weight: float | Sequence[float] | Tensor, exponent: float):
         super().__init__(weight)
-        self.exponent = _positive("exponent", exponent)
+        self.exponent = positive_number("exponent", exponent)
         if self.exponent < LEAST_EXPONENT:
             raise ValueError(
                 f"Expected exponent ≥ {LEAST_EXPONENT:g}, got {exponent:g}; closer to 1 take the absolute cost."
@@ -151,14 +154,12 @@ class PowerCost(SeparableCost):
         return (b.abs() / (self.weight * self.exponent)) ** (1 / (self.exponent - 1))
 
 
-class LogCosCost(SeparableCost):
-    """s(u) = −Σ wᵢ (8a²/π²) ln cos(πuᵢ/(2a)): wᵢuᵢ² for small u, and infinite at |uᵢ| = a, which no law reaches.
+class SoftLimitCost(SeparableCost, ABC):
+    """A cost of each control that is wᵢuᵢ² for small controls, and keeps laws from reaching |uᵢ| = a.
 
     Args:
         weight: w > 0, a number or one for each control.
         limit: a, a number or one for each control.
-
-    Source: Lutter, Mannor, Peters, Fox, Garg, "Value iteration in continuous actions, states and time", ICML 2021.
     """
 
     limit: Float[Tensor, "*m"]
@@ -166,6 +167,17 @@ class LogCosCost(SeparableCost):
     def __init__(self, weight: float | Sequence[float] | Tensor, limit: float | Sequence[float] | Tensor):
         super().__init__(weight)
         self.register_buffer("limit", _weights(limit, "limit"), persistent=False)
+
+    @property
+    def open_limit(self) -> Tensor:
+        return self.limit
+
+
+class LogCosCost(SoftLimitCost):
+    """s(u) = −Σ wᵢ (8a²/π²) ln cos(πuᵢ/(2a)): wᵢuᵢ² for small u, and infinite at |uᵢ| = a, which no law reaches.
+
+    Source: Lutter, Mannor, Peters, Fox, Garg, "Value iteration in continuous actions, states and time", ICML 2021.
+    """
 
     def forward(self, u: Control) -> PerState:
         half = math.pi / 2 / self.limit
@@ -185,24 +197,9 @@ class LogCosCost(SeparableCost):
         half = math.pi / 2 / self.limit
         return torch.atan(b.abs() * half / (2 * self.weight)) / half
 
-    @property
-    def open_limit(self) -> Tensor:
-        return self.limit
 
-
-class EntropyCost(SeparableCost):
-    """s(u) = Σ wᵢa²((1 − v)ln(1 − v) + (1 + v)ln(1 + v)), v = uᵢ/a: wᵢuᵢ² for small u, with infinite slope at |uᵢ| = a.
-
-    Args:
-        weight: w > 0, a number or one for each control.
-        limit: a, a number or one for each control.
-    """
-
-    limit: Float[Tensor, "*m"]
-
-    def __init__(self, weight: float | Sequence[float] | Tensor, limit: float | Sequence[float] | Tensor):
-        super().__init__(weight)
-        self.register_buffer("limit", _weights(limit, "limit"), persistent=False)
+class EntropyCost(SoftLimitCost):
+    """s(u) = Σ wᵢa²((1 − v)ln(1 − v) + (1 + v)ln(1 + v)), v = uᵢ/a, with an infinite slope at |uᵢ| = a."""
 
     def forward(self, u: Control) -> PerState:
         v = u / self.limit
@@ -221,10 +218,6 @@ class EntropyCost(SeparableCost):
 
     def inverse_slope(self, b: Control) -> Control:
         return self.limit * torch.tanh(b.abs() / (2 * self.weight * self.limit))
-
-    @property
-    def open_limit(self) -> Tensor:
-        return self.limit
 
 
 class NormCost(ControlCost):
@@ -259,6 +252,7 @@ class ControlCosts(nn.Module):
     Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 3 (Newton's method with line search).
     """
 
+    costs: nn.ModuleList
     softness: Float[Tensor, ""]  # ρ, zero in the task
 
     def __init__(self, costs: Sequence[ControlCost]):
@@ -284,8 +278,7 @@ class ControlCosts(nn.Module):
     @property
     def open_limits(self) -> list[Tensor]:
         """|u| at which costs are infinite."""
-        ends = [cost.open_limit for cost in self.separable]
-        return [end for end in ends if end is not None]
+        return _open_limits(self.separable)
 
     def forward(self, u: Control) -> PerState:
         value = self.softness * (u * u).sum(-1)
@@ -365,7 +358,7 @@ def _minimise_one(smooth: Sequence[SeparableCost], kinks: Tensor | None, bend: T
         high = pull / bend
         for cost in smooth:
             high = high.minimum(cost.inverse_slope(pull))
-        for end in ControlCosts(smooth).open_limits:
+        for end in _open_limits(smooth):
             high = high.minimum((1 - LEAST_ROOM) * end)
         low, a = torch.zeros_like(high), high
         known = all(type(cost).inverse_slope is not SeparableCost.inverse_slope for cost in smooth)
@@ -378,7 +371,7 @@ def _minimise_one(smooth: Sequence[SeparableCost], kinks: Tensor | None, bend: T
                 break
     slope, curvature = slope_and_curvature(a)
     a = torch.where(curvature.isfinite(), a - slope / curvature.detach(), 0.0)
-    for end in ControlCosts(smooth).open_limits:
+    for end in _open_limits(smooth):
         a = a.minimum((1 - LEAST_ROOM) * end)
     return -b.sign() * a
 
@@ -390,7 +383,7 @@ class _SmoothProgram:
         self, controls: ControlSet, smooth: Sequence[SeparableCost], kinks: Tensor | None, R: ControlMatrix, b: Control
     ):
         self.controls, self.smooth, self.kinks, self.R, self.b = controls, smooth, kinks, R, b
-        self.ends = ControlCosts(smooth).open_limits
+        self.ends = _open_limits(smooth)
 
     def minimum(self) -> Control:
         with torch.no_grad():
@@ -530,9 +523,15 @@ def _minimise_with_kinks(controls: ControlSet, R: ControlMatrix, b: Control, kin
     return u.gather(0, best[None, ..., None].expand(1, *b.shape))[0].to(b)
 
 
+def _open_limits(costs: Sequence[SeparableCost]) -> list[Tensor]:
+    """|u| at which some of the costs are infinite."""
+    ends = [cost.open_limit for cost in costs]
+    return [end for end in ends if end is not None]
+
+
 def _weights(weight: float | Sequence[float] | Tensor, name: str = "weight", least: float | None = None) -> Tensor:
-    """Weights of controls as a tensor, each between `least` and the inverse of LEAST_WEIGHT."""
-    least = LEAST_WEIGHT if least is None else least
+    """Weights of controls as a tensor, each between `least` and the inverse of LEAST_NUMBER."""
+    least = LEAST_NUMBER if least is None else least
     entries = weight if isinstance(weight, list | tuple) else [weight]
     try:
         if not isinstance(weight, Tensor) and not all(type(entry) in (int, float) for entry in entries):
@@ -540,16 +539,10 @@ def _weights(weight: float | Sequence[float] | Tensor, name: str = "weight", lea
         given = torch.as_tensor(weight, dtype=torch.get_default_dtype()).clone()
     except (TypeError, ValueError, OverflowError):
         given = torch.empty(0)
-    inside = given.isfinite() & (given >= least) & (given <= 1 / LEAST_WEIGHT)
+    inside = given.isfinite() & (given >= least) & (given <= 1 / LEAST_NUMBER)
     if given.ndim > 1 or not given.numel() or not bool(inside.all()) or not bool((given > 0).any()):
         raise ValueError(f"Expected {name} as a number > 0, or one for each control, got {weight!r}; correct it.")
     return given
-
-
-def _positive(name: str, number: float) -> float:
-    if type(number) not in (int, float) or not LEAST_WEIGHT <= number <= 1 / LEAST_WEIGHT:
-        raise ValueError(f"Expected {name} > 0, got {number!r}; correct it.")
-    return float(number)
 
 
 CONTROL_COSTS: dict[str, type[ControlCost]] = {

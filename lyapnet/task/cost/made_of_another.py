@@ -11,6 +11,7 @@ from lyapnet.base.interpolation import Interpolant
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import ControlMatrix, PerState, State
 from lyapnet.task.cost.base import BUFFERS, Cost, quadratic_form
+from lyapnet.task.cost.control_costs import ControlCosts
 from lyapnet.task.cost.quadratic import is_quadratic
 
 
@@ -18,6 +19,7 @@ class MadeOfAnother(Cost):
     """A cost that passes everything on to another cost; subclasses change its goal, R(x), q or φ."""
 
     cost: Cost
+    nonquadratic: ControlCosts | None
     words: str = ""  # a description of the change
 
     def __init__(self, cost: Cost):

@@ -146,8 +146,8 @@ def optimal_trajectories(
         rough = StepPrograms(roughly, STEP_SIZES)
         euler = descend(rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
-    if problem.cost.nonquadratic is not None:
-        now = cheapest([now, under(_from_softer_costs(problem, under, descend, now.u))])
+    if softness := _softness_of_kinks(problem):
+        now = cheapest([now, under(_from_softer_costs(problem, softness, under, descend, now.u))])
     programs = StepPrograms(problem, STEP_SIZES)
     now = descend(programs, now, curved=False, kind=kinds - 2).now
     descent = descend(programs, now, curved=True, kind=kinds - 1)
@@ -158,9 +158,9 @@ def optimal_trajectories(
 
 
 def _from_softer_costs(
-    problem: Problem, under: Callable[..., Path], descend: Callable[..., "_Descent"], u: ControlPath
+    problem: Problem, start: float, under: Callable[..., Path], descend: Callable[..., "_Descent"], u: ControlPath
 ) -> ControlPath:
-    """Controls that were optimal as long as ρ‖u‖² was added to a cost of controls with kinks, with ρ falling to zero.
+    """Controls that were optimal as long as ρ‖u‖² was added to a cost of controls with kinks, ρ falling from a start.
 
     Across a kink or between limits an optimum jumps, which quadratic models do not tell.
 
@@ -168,9 +168,8 @@ def _from_softer_costs(
     Applications and Methods 2002.
     """
     softer = copied(problem)
-    costs, start = softer.cost.nonquadratic, softness_of_kinks(problem)
-    if costs is None or not start:
-        return u
+    costs = softer.cost.nonquadratic
+    assert costs is not None
     softness = costs.softness
     programs = StepPrograms(softer, STEP_SIZES)
     for share in SOFTNESS:
@@ -285,7 +284,7 @@ def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Te
         return value.detach(), gradient.detach(), jacobian(gradient, z)
 
 
-def softness_of_kinks(problem: Problem) -> float:
+def _softness_of_kinks(problem: Problem) -> float:
     """ρ at which ρ‖u‖² of the largest controls costs as much as the kinks of their cost; 0 without kinks."""
     costs = problem.cost.nonquadratic
     if costs is None or not costs.kinked:

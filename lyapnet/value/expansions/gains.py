@@ -21,13 +21,13 @@ def gain_of_node(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Te
     """
     if problem.has_linear_law:
         return -solve(Q_uu, Q_ua)
-    dt, (Q_u, Q_ux) = problem.horizon.dt, (Q_ua[..., 0], Q_ua[..., 1:])
-    to = problem.best_control(Q_uu / (2 * dt), (Q_u - (Q_uu @ u[..., None])[..., 0]) / dt)
+    Q_uu, Q_ua = Q_uu / problem.horizon.dt, Q_ua / problem.horizon.dt  # per second, as s
+    to = problem.best_control(Q_uu / 2, Q_ua[..., 0] - (Q_uu @ u[..., None])[..., 0])
     k = to - u
-    slope = (Q_u + (Q_uu @ k[..., None])[..., 0]) / dt
+    slope = Q_ua[..., 0] + (Q_uu @ k[..., None])[..., 0]
     P, S = local_shape(problem.cost.nonquadratic, problem.controls, to, slope)
-    A = P @ (Q_uu if S is None else Q_uu + dt * S) @ P + torch.eye(u.shape[-1]).to(P) - P
-    return torch.cat([k[..., None], -torch.linalg.solve(A, P @ Q_ux)], -1)
+    A = P @ (Q_uu if S is None else Q_uu + S) @ P + torch.eye(u.shape[-1]).to(P) - P
+    return torch.cat([k[..., None], -torch.linalg.solve(A, P @ Q_ua[..., 1:])], -1)
 
 
 def cost_beside(problem: Problem, u: Control, gain: Tensor, left: Tensor) -> Tensor:

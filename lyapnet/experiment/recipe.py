@@ -5,7 +5,7 @@ from typing import Any
 
 # The recipe for an unknown system. The file's own keys have precedence, and a registered program has its recommended
 # weights. With constraints, where V is steep, the law is lookahead. The value program uses Muon, but Adam with control
-# limits, where V_x has kinks.
+# limits or other costs of controls, where V_x has kinks.
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
@@ -22,8 +22,8 @@ STANDARD: dict[str, Any] = {
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},
 }
-COSTATE_LIMIT = 5  # rollout.costate_limit of the recipe, for the value and region programs with control limits
-LISTED = "listed"  # constraints.name without a class
+COSTATE_LIMIT = 5  # rollout.costate_limit of the recipe, for the value and region programs where V_x has kinks
+NOTHING = ("listed", "unbounded")  # constraints.name and controls.name without a class of their own
 
 
 def with_recipe(
@@ -41,7 +41,9 @@ def with_recipe(
         return content
     recipe = dict(STANDARD)
     constrained = _sets_any(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides)
-    limited = _sets_any(("lower", "upper"), "controls", content, overrides)
+    has_kinks = _sets_any(("lower", "upper", "name"), "controls", content, overrides) or _sets_any(
+        ("control_costs",), "cost", content, overrides
+    )
     if constrained:
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
         law = _final_value("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
@@ -52,12 +54,12 @@ def with_recipe(
         _final_value(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
-    if program == "value" and not constrained and not limited:
+    if program == "value" and not constrained and not has_kinks:
         recipe["training"] = {**STANDARD["training"], "optimizer": "muon"}
     if program == "region" or _sets_any(("iterations",), "training", content, overrides):
         # no early stopping: the region loss may stay constant for long before it falls, or the user chose iterations
         recipe["training"] = {**recipe["training"], "least_gain": 0.0}
-    if program in ("value", "region") and gradient == "discrete" and limited:
+    if program in ("value", "region") and gradient == "discrete" and has_kinks:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     return {**content, **standard, "program": {**weights(program), **standard["program"]}}
@@ -71,8 +73,8 @@ def _final_value(key: str, given: Any, overrides: Sequence[str]) -> str:
 def _sets_any(keys: Sequence[str], section: str, content: Mapping[str, Any], overrides: Sequence[str]) -> bool:
     """Whether the file or the command line sets one of some keys of a section."""
     written = content.get(section) or {}
-    if any(written.get(key) not in (None, {}, [], LISTED) for key in keys):
+    if any(written.get(key) not in (None, {}, [], *NOTHING) for key in keys):
         return True
     given = (each.partition("=") for each in overrides)
-    named = tuple(f"{section}.{key}" for key in keys)
-    return any((key == section or key.startswith(named)) and value not in ("", "{}", "null") for key, _, value in given)
+    named, nothing = tuple(f"{section}.{key}" for key in keys), ("", "{}", "[]", "null", *NOTHING)
+    return any((key == section or key.startswith(named)) and value not in nothing for key, _, value in given)

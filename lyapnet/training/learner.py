@@ -82,6 +82,7 @@ class Learner(nn.Module):
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
         self.measured_at: int = -1  # step of the last validation
+        self.rate_share: float = 1.0  # factor of its scheduled learning rate, see ReturnToBest
         self.cooling: tuple[int, int] | None = None  # first and last step of the final decay of its learning rate
         self.region_share: Tensor | None = None  # share of D that is in the region, with the region program
         self.metadata: dict[str, Any] = {}  # plain data for a checkpoint of this member alone

@@ -145,7 +145,7 @@ class TrainingModule(L.LightningModule):
         iterations = options.iterations or self.trainer.estimated_stepping_batches
 
         def rate_of(member: Learner) -> Callable[[int], float]:
-            return lambda step: self.rate_share * options.rate(step, iterations, member.cooling)
+            return lambda step: self.rate_share * member.rate_share * options.rate(step, iterations, member.cooling)
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, [rate_of(member) for member in self.members])
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -49,15 +49,15 @@ class Method(NamedTuple):
     rate: tuple[float, float]  # largest learning rate
 
 
-# With limits of controls or states V_x has kinks. There a V fitted by Muon is accurate along optimal trajectories but
-# oscillates beside them, hence Adam.
+# With limits or other costs of controls, or limits of states, V_x has kinks. There a V fitted by Muon is accurate along
+# optimal trajectories but oscillates beside them, hence Adam.
 SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01))
-WITH_LIMITS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005))
+WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005))
 
 
 def method_for(problem: Problem) -> Method:
     """The optimizer for the fit to optima of a problem."""
-    return WITH_LIMITS if problem.controls.limited or problem.constraints is not None else SMOOTH
+    return SMOOTH if problem.has_linear_law and problem.constraints is None else WITH_KINKS
 
 
 class Examples(NamedTuple):

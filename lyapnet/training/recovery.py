@@ -1,23 +1,18 @@
-"""Recovery from divergence: training goes back to its last checkpoint with a smaller learning rate."""
+"""Recovery from losses that are not finite: training goes back to its last checkpoint with a smaller rate."""
 
 import copy
-import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
 from rich.console import Console
 
 from lyapnet.base.contracts import TO_WRITE, without_slope
 from lyapnet.base.errors import DivergenceError
 from lyapnet.experiment.checkpoint import read_checkpoint
-from lyapnet.task.cost import spread
 from lyapnet.task.domain import as_written
-from lyapnet.training.curves import members_of
+from lyapnet.training.best_weights import RATE_DIVISOR
 from lyapnet.training.learner import Learner
 from lyapnet.training.loggers import drop_logs_after
 from lyapnet.training.plan import Plan
@@ -27,54 +22,7 @@ from lyapnet.value.expansions import in_float64
 from lyapnet.value.policy import HJBPolicy
 
 MAX_RETURNS = 4  # returns to a checkpoint in one process
-RATE_DIVISOR = 3.0  # each return divides the learning rate by this
-DIVERGENCE_COST_RATIO = 2.0  # validation cost relative to its least so far that counts as divergence
-COMPARED_SHARE = 0.9  # cheapest validation states in that cost; without the few that a kink of V makes expensive
 SLOPE_TEST_STATES = 32  # states of X₀ whose closed loops are searched for non-finite derivatives
-
-
-class RisingCost(Callback):
-    """Reports a divergence if the cost rises to DIVERGENCE_COST_RATIO times its least value so far.
-
-    The cost is the mean over the cheapest COMPARED_SHARE of the validation states. Without a goal the rise is measured
-    relative to the spread of V(0, x₀), under noise to the spread of these costs if that is larger: V(0, x₀) may be
-    nearly the same on all of X₀.
-
-    Raises:
-        DivergenceError: the cost has risen so far.
-    """
-
-    def __init__(self) -> None:
-        self.least: dict[str, float] = {}
-
-    def state_dict(self) -> dict[str, Any]:
-        return dict(self.least)
-
-    def load_state_dict(self, state_dict: Mapping[str, float]) -> None:
-        self.least = dict(state_dict)
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step == 0:
-            self.on_validation_end(trainer, pl_module)  # the cost of the initial V
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        for member in members_of(pl_module):
-            assert member.validation is not None
-            costs = member.validation.cost.sort().values
-            cheapest = costs[: math.ceil(COMPARED_SHARE * len(costs))]
-            cost = float(cheapest.mean()) if costs.isfinite().all() else math.inf
-            least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
-            size = least if member.problem.has_goal else float(spread(member.validation.value))
-            if member.problem.noise is not None and not member.problem.has_goal and math.isfinite(cost):
-                size = max(size, float(spread(cheapest)))
-            if cost - least > (DIVERGENCE_COST_RATIO - 1) * size > 0:
-                module: Any = pl_module
-                raise DivergenceError(
-                    f"{module.place(member.label)}: Expected a cost on the cheapest {COMPARED_SHARE:.0%} of the "
-                    f"validation states of at most {least + (DIVERGENCE_COST_RATIO - 1) * size:.4g}, as {least:.4g} "
-                    f"was reached before, got {cost:.4g}; lower training.learning_rate or set "
-                    "trainer.gradient_clip_val."
-                )
 
 
 class Returns:
@@ -116,7 +64,7 @@ class Returns:
         module.rate_share /= RATE_DIVISOR
         self.count += 1
         entry = {"to": plan.step, "rate_share": module.rate_share, "because": str(error)}
-        plan.run.note(returns=[*plan.run.record()["returns"], entry])
+        plan.run.note_return(entry)
         self.console.print(
             f"{error} Going back to step {plan.step}, with {module.rate_share:.2g} of the scheduled learning rate "
             f"(return {self.count} of at most {MAX_RETURNS}).",

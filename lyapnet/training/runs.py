@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,10 @@ class TrainingRun:
     def note(self, **facts: Any) -> None:
         """Add facts to the record, or replace them."""
         write_json(self.folder / RUN_RECORD, {**self.record(), **facts})
+
+    def note_return(self, entry: Mapping[str, Any]) -> None:
+        """Add a return to earlier weights to the record."""
+        self.note(returns=[*self.record()["returns"], dict(entry)])
 
     @property
     def finished(self) -> bool:

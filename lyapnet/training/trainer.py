@@ -6,6 +6,7 @@ import lightning as L
 from rich.console import Console
 
 from lyapnet.experiment.config import configs_of_seeds
+from lyapnet.training.best_weights import ReturnToBest
 from lyapnet.training.certified_share import CertifiedShare
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.checkpoints import Checkpoints, KeptStart
@@ -17,7 +18,6 @@ from lyapnet.training.loggers import loggers_of_run
 from lyapnet.training.lost_states import LostStates
 from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
-from lyapnet.training.recovery import RisingCost
 from lyapnet.training.settling import Settling
 from lyapnet.training.stage_messages import PATIENCE, StageMessages
 from lyapnet.training.trainer_options import trainer_options
@@ -61,7 +61,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         FigureLogger(every * options.figures_every, options.animate),
         *([certified] if options.certify_every else []),
         TrainingProgress(stages),
-        RisingCost(),
+        ReturnToBest(config.training.least_gain > 0, partial(console.print, soft_wrap=True), run.note_return),
         Settling(config.training.least_gain, config.training.warmup, stages),
         *([LostStates()] if config.training.lost_share else []),
         *plan.callbacks,

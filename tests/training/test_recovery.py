@@ -1,24 +1,19 @@
 """A training that diverges goes back and on more slowly; it gives up after a while, with the cause."""
 
 import math
-from contextlib import nullcontext
-from types import SimpleNamespace
 
 import pytest
 import torch
-from lightning import Trainer
 from rich.console import Console
 
 from lyapnet.base.errors import DivergenceError
 from lyapnet.base.files import read_json
 from lyapnet.experiment.checkpoint import read_checkpoint
-from lyapnet.experiment.config import config_from_plain
-from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
-from lyapnet.training.build import build_module
+from lyapnet.training.best_weights import RATE_DIVISOR
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
-from lyapnet.training.recovery import COMPARED_SHARE, DIVERGENCE_COST_RATIO, MAX_RETURNS, RATE_DIVISOR, RisingCost
+from lyapnet.training.recovery import MAX_RETURNS
 
 
 @pytest.fixture
@@ -121,43 +116,6 @@ def test_a_stiff_law_is_named(config, capsys, monkeypatch):
     config["rollout"]["policy"] = "hjb"
     with pytest.raises(DivergenceError, match=r"too long for the law.*rollout\.policy=sampled"):
         run_of(config, capsys)
-
-
-def test_a_rising_cost_is_a_divergence(config, tmp_path):
-    module, watch, resumed = build_module(config_from_plain(config)), RisingCost(), RisingCost()
-    trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
-
-    def validate(watch, cost):
-        few = int((1 - COMPARED_SHARE) * 64)  # that cost far more
-        costs = torch.cat([torch.full((64 - few,), cost), torch.full((few,), 1e6)])[torch.randperm(64)]
-        module.members[0].validation = SimpleNamespace(cost=costs)
-        watch.on_validation_end(trainer, module)
-
-    for cost in (3.0, 2.0, 0.99 * 2 * DIVERGENCE_COST_RATIO, 2.0):
-        validate(watch, cost)
-    resumed.load_state_dict(watch.state_dict())
-    for each in (watch, resumed):
-        with pytest.raises(DivergenceError, match=f"at most {2 * DIVERGENCE_COST_RATIO:g}, as 2 was reached before"):
-            validate(each, 1.01 * 2 * DIVERGENCE_COST_RATIO)
-
-
-@pytest.mark.parametrize("noise", [{}, {"velocity": 0.5}], ids=["without noise", "under noise"])
-def test_under_noise_a_rise_within_the_spread_of_costs_is_no_divergence(noise, config, tmp_path, monkeypatch):
-    """In a task without a goal from one initial state, where V(0, x₀) has no spread."""
-    module, watch = build_module(config_from_plain({**config, "noise": noise})), RisingCost()
-    monkeypatch.setattr(Problem, "has_goal", False)
-    trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
-
-    def validate(mean):
-        values = torch.linspace(1.999, 2.001, 64)
-        module.members[0].validation = SimpleNamespace(cost=torch.linspace(mean - 1, mean + 1, 64), value=values)
-        watch.on_validation_end(trainer, module)
-
-    validate(2.0)
-    with nullcontext() if noise else pytest.raises(DivergenceError):
-        validate(2.1)
-    with pytest.raises(DivergenceError):
-        validate(4.0)
 
 
 @pytest.mark.gate

@@ -1,0 +1,137 @@
+"""Training that has become worse returns to its best weights, with a smaller learning rate."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from lyapnet.task.cost import spread
+from lyapnet.training.curves import members_of
+from lyapnet.training.learner import Learner, mean_over_processes
+
+RATE_DIVISOR = 3.0  # each return divides the learning rate by this
+WORSE_BY = 0.01  # relative cost above that of the best weights from which on training counts as worse
+WORSE_FOR = 60  # steps of this before it returns
+DIVERGENCE_COST_RATIO = 2.0  # cost relative to that of the best weights from which on it returns at once
+COMPARED_SHARE = 0.9  # cheapest validation states in that cost; without the few that a kink of V makes expensive
+
+
+@dataclass
+class Best:
+    """The best weights of a member so far, with what is needed to train on from them."""
+
+    loss: float = math.inf  # least validation loss
+    step: int = 0
+    cost: float = math.inf  # mean cost of the validation states
+    cheapest: float = math.inf  # that of the cheapest COMPARED_SHARE of them
+    weights: dict[str, Tensor] = field(default_factory=dict)
+    optimizer: list[dict[str, Any]] = field(default_factory=list)  # state of the optimizer for each parameter of V
+    worse_since: int | None = None  # first of the last consecutive validations that were worse
+    rate_share: float = 1.0  # factor of the scheduled learning rate
+
+
+class ReturnToBest(Callback):
+    """Returns a member to its best weights once its closed loops have become dearer, and at the end of its training.
+
+    The best weights are those of the least validation loss, as in best.ckpt. Training is worse where the mean cost of
+    the validation states exceeds theirs by more than WORSE_BY. After WORSE_FOR steps of this, or at once if the
+    cheapest COMPARED_SHARE of the states cost DIVERGENCE_COST_RATIO times as much, weights and optimizer return to
+    their best state, and the learning rate becomes a third. After its last step a member that is worse has its best
+    weights: a resumed or fine-tuned run starts from there.
+
+    Without a goal costs are relative to the spread of V(0, x₀), under noise to that of the costs if it is larger:
+    V(0, x₀) may be nearly the same on all of X₀.
+
+    Args:
+        returns_if_worse: whether it returns after WORSE_FOR steps too. A training from random weights goes up and down
+            by more than WORSE_BY.
+        say: shows a line.
+        note: adds a return to the run's record.
+    """
+
+    def __init__(self, returns_if_worse: bool, say: Callable[[str], None], note: Callable[[Mapping[str, Any]], None]):
+        self.returns_if_worse, self.say, self.note = returns_if_worse, say, note
+        self.best: dict[str, Best] = {}  # by label
+
+    def state_dict(self) -> dict[str, Any]:
+        return {label: asdict(best) for label, best in self.best.items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        self.best = {label: Best(**stored) for label, stored in state_dict.items()}
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for member in members_of(pl_module):
+            best = self.best.setdefault(member.label, Best())
+            member.rate_share = best.rate_share
+        if trainer.global_step == 0:
+            self.on_validation_end(trainer, pl_module)  # the initial V
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for member, group in zip(members_of(pl_module), trainer.optimizers[0].param_groups, strict=True):
+            if member.measured_at == trainer.global_step:  # its training has not ended before
+                self._compare(trainer, member, group)
+
+    def _compare(self, trainer: Trainer, member: Learner, group: dict[str, Any]) -> None:
+        """Compare a member with its best weights, and keep or restore them."""
+        assert member.validation is not None
+        step, best = trainer.global_step, self.best[member.label]
+        loss, cost, cheapest, spread_of_costs = (_mean_over_processes(value, member) for value in _measures(member))
+        if loss < best.loss or not math.isfinite(best.loss):
+            best.loss, best.step, best.cost, best.cheapest, best.worse_since = loss, step, cost, cheapest, None
+            best.weights = {name: value.clone() for name, value in member.V.state_dict().items()}
+            states = (trainer.optimizers[0].state.get(p, {}) for p in group["params"])
+            best.optimizer = [_copy_of(state) for state in states]
+            return
+        sizes = (best.cost, best.cheapest) if member.problem.has_goal else (spread_of_costs, spread_of_costs)
+        diverges = cheapest - best.cheapest > (DIVERGENCE_COST_RATIO - 1) * sizes[1]
+        if not (diverges or cost - best.cost > WORSE_BY * sizes[0]):
+            best.worse_since = None
+            return
+        best.worse_since = step if best.worse_since is None else best.worse_since
+        ends = step >= (member.cooling[1] if member.cooling else trainer.max_epochs or math.inf)
+        if ends or diverges or (self.returns_if_worse and step - best.worse_since >= WORSE_FOR):
+            self._return(
+                trainer, member, group, f"cost {cost:.4g} at step {step}, {best.cost:.4g} at step {best.step}", ends
+            )
+
+    def _return(self, trainer: Trainer, member: Learner, group: dict[str, Any], because: str, ends: bool) -> None:
+        """Restore the best weights of a member."""
+        best = self.best[member.label]
+        member.V.load_state_dict(best.weights)
+        for p, state in zip(group["params"], best.optimizer, strict=True):
+            trainer.optimizers[0].state[p] = _copy_of(state)
+        best.worse_since = None
+        what = "training ends with the weights of that step"
+        if not ends:
+            best.rate_share = member.rate_share = best.rate_share / RATE_DIVISOR
+            group["lr"] /= RATE_DIVISOR
+            what = f"it goes on from there, with {best.rate_share:.2g} of the scheduled learning rate"
+        if trainer.is_global_zero:
+            named = f" of {member.label.replace('_', ' ')}" if member.label else ""
+            self.say(f"worse: the validation states{named} {because}; {what}")
+            self.note({"to": best.step, "rate_share": best.rate_share, "because": because})
+
+
+def _measures(member: Learner) -> tuple[float, float, float, float]:
+    """The validation loss, the mean cost, that of the cheapest states, and the spread of costs."""
+    assert member.validation is not None
+    costs = member.validation.cost.nan_to_num(math.inf).sort().values
+    cheapest = costs[: math.ceil(COMPARED_SHARE * len(costs))]
+    size = float(spread(member.validation.value))
+    if member.problem.noise is not None:
+        size = max(size, float(spread(cheapest)))
+    return member.validation_loss, float(costs.mean()), float(cheapest.mean()), size
+
+
+def _mean_over_processes(value: float, member: Learner) -> float:
+    own = torch.tensor(value, dtype=torch.float64, device=member.problem.goal.device)
+    return float(mean_over_processes(own))
+
+
+def _copy_of(state: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of the optimizer's state for one parameter."""
+    return {key: value.clone() if isinstance(value, Tensor) else value for key, value in state.items()}

@@ -9,7 +9,7 @@ from lyapnet.training import pretraining
 
 def shorten_fits(patch: pytest.MonkeyPatch, first: int, later: int) -> None:
     """Fit in fewer steps, before and after the fitted law shows where it leads, by any method."""
-    for name in ("SMOOTH", "WITH_LIMITS"):
+    for name in ("SMOOTH", "WITH_KINKS"):
         patch.setattr(pretraining, name, getattr(pretraining, name)._replace(steps=(first, later)))
 
 

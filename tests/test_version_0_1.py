@@ -49,6 +49,8 @@ def known_then(evaluation):
 
 LATER = (
     "worst_corner",
+    "worst_ratio",
+    "lost_fraction",
     "falling_fraction",
     "program",
     "largest_rise",

@@ -10,11 +10,14 @@ from torch import Tensor
 from lyapnet.base.types import ControlPath, PerState, State
 from lyapnet.evaluation.optimality import in_spreads, mean_optimum, ratio_of_means
 from lyapnet.loop.programs import Program
-from lyapnet.loop.programs.terms import falls, hinge, largest_rise, satisfied
+from lyapnet.loop.programs.terms import MIN_COST_SHARE, falls, hinge, largest_rise, satisfied
 from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.cost import arrival_steps, time_cost_of
 from lyapnet.task.domain import BORDER_ROUNDING, SLACK
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import ControlSet
+
+LOST_RATIO = 1.05  # J / J* above which a state counts as lost
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class StateTable:
     worst: Tensor | None = None  # (b, k): max_n h(x_n); None without constraints
     worst_time: Tensor | None = None  # (b, k): time of this maximum
     left: Tensor | None = None  # (b,) bool: whether the closed loop leaves the domain; None without a domain
+    arrival: PerState | None = None  # time after which x stays near the goal, see TimeCost; infinite if it does not
     has_goal: bool = True  # whether the task has a goal; otherwise only costs, V and constraints are meaningful
 
     def rows(self, chosen: slice) -> "StateTable":
@@ -57,8 +61,17 @@ class StateTable:
             **self.against_optimum(),
             "value_mean": float(self.value.mean()),
             "constraint_loss": float(self.constraint_loss.mean()),
+            **self._arrivals(),
         }
         return {**summary, **self._about_goal()} if self.has_goal else summary
+
+    def _arrivals(self) -> dict[str, float | None]:
+        """The mean time of arrival of those that arrive, and the share that does; empty without a cost of time."""
+        if self.arrival is None:
+            return {}
+        arrived = self.arrival.isfinite()
+        mean = float(self.arrival[arrived].mean()) if arrived.any() else None
+        return {"arrival_time": mean, "arrived_fraction": _share(arrived)}
 
     def _about_goal(self) -> dict[str, float | None]:
         """The measures of V as a Lyapunov function, relative to its size."""
@@ -100,7 +113,9 @@ class StateTable:
     def against_optimum(self) -> dict[str, float | None]:
         """Mean J / mean J*, and mean |V(0, x₀) − J*| / mean J*, over the states whose J* is known.
 
-        Without a goal they are the regret, mean (J − J*) / spread of J*, and mean |V(0, x₀) − J*| / spread of J*.
+        Besides J / J* of the worst state, and the share of states where it is above LOST_RATIO, with J* at least
+        MIN_COST_SHARE of its mean. Without a goal they are the regret, mean (J − J*) / spread of J*, and mean
+        |V(0, x₀) − J*| / spread of J*.
         """
         optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
         error = (self.value - optimal).abs()
@@ -109,9 +124,21 @@ class StateTable:
             "optimal_cost_mean": mean_optimum(optimal),
             "cost_ratio": ratio_of_means(self.cost, optimal) if self.has_goal else None,
             **regret,
+            **(_worst_states(self.cost, optimal) if self.has_goal else {}),
             "value_error": ratio_of_means(error, optimal) if self.has_goal else in_spreads(error, optimal),
             "optimum_failures": None if self.optimal_cost is None else int((~optimal.isfinite()).sum()),
         }
+
+
+def _worst_states(cost: PerState, optimal: PerState) -> dict[str, float | None]:
+    """The largest J / J*, and the share of states where it is above LOST_RATIO; None if no J* is known."""
+    known = optimal.isfinite()
+    if not known.any():
+        return {"worst_ratio": None, "lost_fraction": None}
+    J, least = cost[known], optimal[known]
+    floor = (MIN_COST_SHARE * least.mean()).clamp_min(torch.finfo(least.dtype).tiny)
+    ratio = 1 + (J - least) / least.maximum(floor)
+    return {"worst_ratio": float(ratio.max()), "lost_fraction": _share(ratio > LOST_RATIO)}
 
 
 def measure(
@@ -142,6 +169,7 @@ def measure(
         at_limits=_at_limits(problem.controls, trajectory.u),
         worst=worst,
         worst_time=worst_time,
+        arrival=_arrival(problem, trajectory),
         has_goal=problem.has_goal,
     )
 
@@ -155,6 +183,14 @@ def cost_within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerSta
         return trajectory.expected_cost, None
     far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
     return trajectory.expected_cost.masked_fill(far, torch.inf), left
+
+
+def _arrival(problem: Problem, trajectory: Trajectory) -> PerState | None:
+    """The time after which each closed loop stays near the goal; None without a cost of time, and with noise."""
+    if time_cost_of(problem.cost) is None or problem.noise is not None:
+        return None
+    steps, N = arrival_steps(problem.cost, trajectory.x), problem.horizon.steps
+    return (problem.horizon.dt * steps.to(trajectory.x)).masked_fill(steps > N, torch.inf)
 
 
 def _worst(problem: Problem, trajectory: Trajectory) -> tuple[Tensor | None, Tensor | None]:

@@ -102,6 +102,10 @@ class CostConfig:
     huber: float | None = setting(
         None, "δ: 2δ²(√(1 + q/δ²) − 1) replaces q, and likewise φ, for less growth far away.", above=0
     )
+    time: float | None = setting(
+        None, "Cost of each second until all states of cost.within are about so near their goal.", above=0
+    )
+    within: dict[str, float] = setting({}, "State: distance from the goal at which time costs no more.")
     obstacles: list[dict[str, Any]] = setting([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
     control_costs: list[dict[str, Any]] = setting(
         [], "Costs of controls beside uᵀRu, each as {name: …, weight: …}: absolute, norm, power, …"

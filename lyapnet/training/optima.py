@@ -79,7 +79,8 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
             paths.append(path_under(exact, lambda n, _: oracle_controls[n], others))
         u = cheapest(paths).u
         optimum = _concatenate(
-            optimum, optimal_trajectories(problem, others, u, progress=progress, seconds=SEARCH_SECONDS)
+            optimum,
+            optimal_trajectories(problem, others, u, progress=progress, seconds=SEARCH_SECONDS, softer_first=False),
         )
     return _improve_from_neighbours(exact, optimum, report)
 
@@ -143,7 +144,7 @@ def _replace_improved(problem: Problem, optimum: Optimum, rows: Tensor, found: O
     size, cost = sizes(problem, optimum.path.cost)[rows], found.cost[: len(rows)]
     better = torch.nonzero(cost < optimum.path.cost[rows] - (1 - ORACLE_IMPROVEMENT) * size).flatten()
     if len(better):
-        closer = optimal_trajectories(problem, optimum.path.x[0, rows[better]], found.u[:, better])
+        closer = optimal_trajectories(problem, optimum.path.x[0, rows[better]], found.u[:, better], softer_first=False)
         optimum = _replace_rows(optimum, rows[better], closer)
     return optimum, len(better)
 
@@ -160,7 +161,8 @@ def _improve_from_neighbours(exact: Problem, optimum: Optimum, report: StageRepo
         ).flatten()
         if not len(improved):
             break
-        optimum = _replace_rows(optimum, improved, optimal_trajectories(exact, x0[improved], best.u[:, improved]))
+        better = optimal_trajectories(exact, x0[improved], best.u[:, improved], softer_first=False)
+        optimum = _replace_rows(optimum, improved, better)
     return optimum
 
 

@@ -17,6 +17,7 @@ from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
+from lyapnet.training.later_optima import TIMES, later_optima
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
@@ -34,6 +35,7 @@ NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookah
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 MAX_ROUNDS = 4  # rounds of fitting at the states that the fitted law visits
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
+POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
@@ -121,12 +123,37 @@ def examples_visited(problem: Problem, optimum: Optimum, path: Path, ahead: bool
     return _build_examples(problem, optimum, [_limit_deviations(problem, optimum, deviation, TRUST_LIMIT)], ahead)
 
 
+def examples_beyond(
+    learner: Learner, optimum: Optimum, path: Path, generator: torch.Generator, progress: Callable[[int, int], None]
+) -> list[Examples]:
+    """Examples along new optima from states at which costly closed loops have left the known ones; see later_optima."""
+    problem, ahead = learner.problem, looks_ahead(learner)
+    if problem.horizon.stationary:
+        return []
+    deviation = path.x[:-1] - optimum.expansion.x[:-1]
+    is_known = _trusted_share(problem, optimum, deviation, TRUST_LIMIT) >= 1
+    found = later_optima(problem, optimum, path, is_known, generator, FIT_SECONDS[1] / len(TIMES), progress)
+    examples, least = list[Examples](), typical_cost(sizes(problem, optimum.path.cost))
+    for node, later, optima in found:
+        own, began = draw_examples(later, optima, generator, ahead), node * problem.horizon.dt
+        cost = own.cost.clamp_min(least)
+        examples.append(
+            own._replace(t=own.t + began, after=own.after + began, cost=cost, rate=cost / problem.horizon.duration)
+        )
+    return examples
+
+
 def _limit_deviations(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
     """Scale down deviations δ (N, b, n) for which ½ δᵀ|H|δ is more than a share of the cost."""
+    return _trusted_share(problem, optimum, deviation, share)[..., None] * deviation
+
+
+def _trusted_share(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> Tensor:
+    """The factor (N, b) ≤ 1 of deviations δ (N, b, n) with which ½ δᵀ|H|δ is at most a share of the cost."""
     values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
     quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
     ratio = share * _error_scale(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
-    return ratio.sqrt().clamp_max(1)[..., None] * deviation
+    return ratio.sqrt().clamp_max(1)
 
 
 def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
@@ -292,16 +319,28 @@ def relative_misfit(V: ValueFunction, examples: Examples) -> float:
         return float((own.maximum(least).log() - known.maximum(least).log()).square().mean().nan_to_num(torch.inf))
 
 
-def fit(learner: Learner, optimum: Optimum, examples: Examples, report: StageReport = silent) -> None:
+def fit(
+    learner: Learner,
+    optimum: Optimum,
+    examples: Examples,
+    report: StageReport = silent,
+    gain_of_another_law: Callable[[], float] = lambda: 0.0,
+) -> float:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, or after
-    PATIENCE rounds without gain. The V with the cheapest law is kept.
+    The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, after PATIENCE
+    rounds without gain, or when another law of V costs less while half of the closed loops cost POOR_COST_RATIO times
+    their optimum. The V with the cheapest law is kept.
 
     Args:
         report: called with each stage of the work.
+        gain_of_another_law: the relative cost that another law of the current V saves, 0 if it does not save enough.
+
+    Returns:
+        What another law saves, if that has ended the fit, else 0.
     """
     fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _select_finite(optimum)
+    beyond, gain_of_other = stream(learner.seed, START, 12), 0.0
     method = fitting.method
     best, least, rounds_without_gain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
     size = float(sizes(learner.problem, optimum.path.cost).mean())
@@ -319,8 +358,16 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: StageRep
             best, least = copy.deepcopy(learner.V.state_dict()), now
         if k == MAX_ROUNDS or now[1] <= enough or rounds_without_gain == PATIENCE:
             break
+        if float((path.cost / optimum.path.cost).median()) > POOR_COST_RATIO:
+            gain_of_other = gain_of_another_law()
+            if gain_of_other:
+                break
         examples = examples.concatenated_with(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
+        searching = partial(report, "optima from states where its law leads")
+        for further in examples_beyond(learner, optimum, path, beyond, searching):
+            examples = examples.concatenated_with(further)
     learner.V.load_state_dict(best)
+    return gain_of_other
 
 
 def looks_ahead(learner: Learner) -> bool:

@@ -17,6 +17,7 @@ from lyapnet.training.stage_messages import StageMessages
 VALIDATED = (
     ("cost", "cost_mean", ".4g"),
     ("cost/optimum", "cost_ratio", ".4f"),
+    ("worst", "worst_ratio", ".3g"),
     ("regret", "regret", ".2%"),
     ("constraint loss", "constraint_loss", ".3g"),
     ("satisfied", "satisfied_fraction", ".0%"),

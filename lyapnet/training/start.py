@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.random_streams import START, stream
@@ -106,18 +106,20 @@ def choose_start(
     seeks_optima = _optima_may_help(
         problem, expansions.get(base.name), x0[:TEST_STATES], partial(report, f"improving on {base.name}")
     )
-    optimum = _fit_to_optima(learners, list(expansions.values()), drawn, base, trials) if seeks_optima else None
+    may_look_ahead = may_look_ahead and not problem.risk  # which that law does not know
+    optimum, gain_ahead = None, 0.0
+    if seeks_optima:
+        optimum, gain_ahead = _fit_to_optima(learners, list(expansions.values()), drawn, base, trials, may_look_ahead)
     chosen = _cheapest(trials.tried)
     if chosen.name == ZERO_VALUE:
         for network, state in zip(networks, drawn, strict=True):
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost:
                 network.scale.fill_(abs(chosen.cost))
-    policy, gain_ahead = learners[0].rollout.closed_loop.policy, 0.0
+    policy = learners[0].rollout.closed_loop.policy
     if seeks_optima and type(policy) is SampledPolicy:
         report("closed loops of the law that looks ahead")
-        gain_ahead = _gain_by_looking_ahead(policy, x0[:TEST_STATES])
-        may_look_ahead = may_look_ahead and not problem.risk  # which that law does not know
+        gain_ahead = gain_ahead or _gain_by_looking_ahead(policy, x0[:TEST_STATES])
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
             policy = LookaheadPolicy(problem, policy.V)
             chosen = _fit_for_looking_ahead(learners, list(expansions.values()), drawn, optimum, trials)
@@ -146,17 +148,23 @@ def _attempt_expansions_under_noise(
             attempt(ANOTHER_WAY, other)
 
 
-def _gain_by_looking_ahead(policy: SampledPolicy, x0: State) -> float:
+def _gain_by_looking_ahead(policy: SampledPolicy, x0: State, typically: bool = False) -> float:
     """The relative cost that the lookahead law saves against the sampled law of V; 0 if it saves nothing.
 
     It is 1 if more closed loops of the lookahead law are finite, and 0 if one of them is not finite otherwise.
+
+    Args:
+        typically: the median of these gains from each state, so that it does not depend on a few lost loops.
     """
     problem = policy.problem
     laws = policy, LookaheadPolicy(problem, policy.V)
     now, ahead = (costs_of_holding(law, problem.horizon, problem, x0) for law in laws)
-    if not now.isfinite().all():
+    if typically:
+        gain = ((now - ahead) / sizes(problem, ahead)).nan_to_num(math.inf).median()
+    elif not now.isfinite().all():
         return float(ahead.isfinite().sum() > now.isfinite().sum())
-    gain = (now - ahead).mean() / sizes(problem, ahead).mean()
+    else:
+        gain = (now - ahead).mean() / sizes(problem, ahead).mean()
     return max(float(gain), 0.0) if math.isfinite(gain) else 0.0
 
 
@@ -211,10 +219,17 @@ def _fit_to_optima(
     drawn: Sequence[dict[str, Tensor]],
     base: Candidate,
     trials: "_Trials",
-) -> Optimum | None:
-    """Fit the networks to optimal trajectories and return these; None if there are none.
+    may_look_ahead: bool,
+) -> tuple[Optimum | None, float]:
+    """Fit the networks to optimal trajectories.
 
     If the fitted networks are no better than the base candidate, they are restored.
+
+    Args:
+        may_look_ahead: whether a fit may end early because the lookahead law of its V costs much less.
+
+    Returns:
+        The optimal trajectories, None if there are none; and what the lookahead law saves, if fits have ended early.
     """
     problem, x0, report = learners[0].problem, trials.x0, trials.report
     before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
@@ -224,12 +239,12 @@ def _fit_to_optima(
         solutions = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
         trials.leave_out("optima from states of X₀", singular(error))
-        return None
+        return None, 0.0
     optimum = minima(problem, solutions)
     found = len(optimum.path.cost)
     if not found:
         trials.leave_out("optima from states of X₀", _reason_for_no_optimum(solutions))
-        return None
+        return None, 0.0
     examples = draw_examples(problem, optimum, stream(0, START, 4), looks_ahead(learners[0]))
     name = f"{found} optima from states of X₀"
     trials.note(name, _describe_replaced_derivatives(optimum))
@@ -239,13 +254,22 @@ def _fit_to_optima(
         rivals.append(trials.roll_out("the regulator, up to where it is right"))
         if _cheapest(rivals) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
+    gains = list[float]()
     for learner in learners:
-        fit(learner, optimum, examples, report)
+        policy = learner.rollout.closed_loop.policy
+
+        def gain_by_looking_ahead(policy: nn.Module = policy) -> float:
+            if not may_look_ahead or type(policy) is not SampledPolicy:
+                return 0.0
+            gain = _gain_by_looking_ahead(policy, x0[:TEST_STATES], typically=True)
+            return gain if gain > MIN_LOOKAHEAD_GAIN else 0.0
+
+        gains.append(fit(learner, optimum, examples, report, gain_by_looking_ahead))
     fitted = trials.roll_out(name)
     if _cheapest([*rivals, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
-    return optimum
+    return optimum, min(gains)
 
 
 def _reason_for_no_optimum(solutions: Optimum) -> Missing:

@@ -16,7 +16,7 @@ from lyapnet.experiment.assembly.classes import DTYPES, Parts, float64_defaults,
 from lyapnet.experiment.assembly.constraints import ball_of, build_constraints, choose_margins
 from lyapnet.experiment.assembly.control_costs import KEY, control_costs_of, within_open_limits
 from lyapnet.experiment.assembly.domain import in_domain
-from lyapnet.experiment.assembly.entries import index_of, repeated, require_length, rows
+from lyapnet.experiment.assembly.entries import by_state, index_of, repeated, require_length, rows
 from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
 from lyapnet.experiment.assembly.noise import build_noise, check_risk
@@ -35,6 +35,7 @@ from lyapnet.task.cost import (
     PseudoHuberCost,
     QuadraticCost,
     RegulatorTail,
+    TimeCost,
 )
 from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.problem import TRIED, Problem
@@ -70,6 +71,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = build_cost(_cost_section(config), system) if cost is None else cost.double()
             if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
                 cost = PseudoHuberCost(cost, config.cost.huber)
+            if not isinstance(parts.cost, MadeOfAnother):
+                cost = _with_time(config.cost, cost, system)
         check_shapes_of_cost(copied(cost), system.m, x)
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
@@ -198,6 +201,11 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
             raise UsageError("Expected cost.periodic with the quadratic cost, got another; write it into your own.")
         return instance_of(config, "cost")
     assert system is not None
+    if config.time is not None:  # time is what states cost, and at the end as much as in a last second near the goal
+        at_end = (config.time * _nearness(config, system)).tolist()
+        config = replace(
+            config, Q=0.0 if config.Q is None else config.Q, Q_T=at_end if config.Q_T is None else config.Q_T
+        )
     for key in ("Q", "R", "Q_T"):
         if getattr(config, key) is None:
             raise UsageError(
@@ -239,6 +247,32 @@ def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlAff
         if beside.any():
             raise UsageError("Expected no products of a cost.periodic angle in Q and Q_T, got some; remove them.")
     return PeriodicCost(cost, angles, system.n)
+
+
+def _with_time(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
+    """The cost with the cost of time of a config."""
+    if config.time is None:
+        if config.within:
+            raise UsageError("Expected a cost.time with cost.within, got none; give the cost of a second.")
+        return cost
+    Q = _nearness(config, system)
+    near = QuadraticCost(Q=Q, R=torch.eye(1), Q_T=Q)
+    near = _make_periodic(config.periodic, near, system) if config.periodic else near
+    return TimeCost(cost, near, config.time, system.n)
+
+
+def _nearness(config: CostConfig, system: ControlAffineSystem) -> Tensor:
+    """Q (n, n) with xᵀQx = ½ Σ_i (x_i/w_i)², of the distances w_i of cost.within."""
+    widths = by_state(config.within, "cost.within", system)
+    if not widths or not all(type(width) in (int, float) and 0 < width < math.inf for width in widths.values()):
+        raise UsageError(
+            f"Expected cost.within as {{state: distance > 0}} with cost.time, got {config.within}; say how near the "
+            "goal counts as there."
+        )
+    Q = torch.zeros(system.n, system.n)
+    for i, width in widths.items():
+        Q[i, i] = 1 / (2 * width**2)
+    return Q
 
 
 def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:

@@ -16,6 +16,7 @@ from lyapnet.task.cost.made_of_another import (
 from lyapnet.task.cost.penalty import PenaltyCost, closeness
 from lyapnet.task.cost.quadratic import QuadraticCost, is_quadratic
 from lyapnet.task.cost.smoothed import SmoothedCost
+from lyapnet.task.cost.time import TimeCost, arrival_steps, squared_distance, time_cost_of
 from lyapnet.task.cost.weights import MATRICES, DiagonalWeights, with_matrices
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
@@ -35,6 +36,8 @@ __all__ = [
     "RegulatorsTail",
     "SmoothedCost",
     "TargetCost",
+    "TimeCost",
+    "arrival_steps",
     "closeness",
     "goal_in_words",
     "innermost",
@@ -42,5 +45,7 @@ __all__ = [
     "is_quadratic_about_target",
     "reason_for_no_goal",
     "spread",
+    "squared_distance",
+    "time_cost_of",
     "with_matrices",
 ]

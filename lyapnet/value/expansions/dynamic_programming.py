@@ -19,7 +19,7 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.types import ControlPath, PerState, State, StatePath
-from lyapnet.task.cost import PenaltyCost, spread
+from lyapnet.task.cost import PenaltyCost, spread, squared_distance, time_cost_of
 from lyapnet.task.noise import Noise, once_if_constant
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
@@ -46,6 +46,8 @@ EXPECTED_TOLERANCE = 1e-12  # relative expected gain at which it ends
 HOPELESS_COST_RATIO = 2.0  # cost relative to a settled rival, from which on a trajectory is given up
 GRACE_ITERATIONS = 20  # first iterations in which none is given up
 SOFTNESS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # ρ of softer costs of controls, in units of that of their kinks
+NARROWING = 3.0  # factor between the distances at which consecutive costs of time end
+WIDENING_STATES = 256  # states of X₀ whose distance from the goal is that of the first
 TRIES = 9  # consecutive failed line searches, each with ten times the damping, after which a trajectory is given up
 
 
@@ -112,6 +114,7 @@ def optimal_trajectories(
     rivals: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
     seconds: float = math.inf,
+    softer_first: bool = True,
 ) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), with controls (N, b, m) as initial guess.
 
@@ -126,6 +129,7 @@ def optimal_trajectories(
             those that cost HOPELESS_COST_RATIO times as much are given up.
         progress: called with the number of finished trajectories and their total, averaged over the phases.
         seconds: CPU seconds of this thread after which the descent stops.
+        softer_first: whether softer costs come first where the task needs them; no if the guess is nearly optimal.
     """
     until = time.thread_time() + seconds
     noise, problem = in_float64(problem).noise, in_float64(problem).without_noise()
@@ -146,36 +150,71 @@ def optimal_trajectories(
         rough = StepPrograms(roughly, STEP_SIZES)
         euler = descend(rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
-    if softness := _softness_of_kinks(problem):
-        now = cheapest([now, under(_from_softer_costs(problem, softness, under, descend, now.u))])
+    if softer_first and (stages := _softer_costs(problem)):
+        now = cheapest([now, under(_from_softer_costs(problem, stages, under, descend, now.u))])
     programs = StepPrograms(problem, STEP_SIZES)
     now = descend(programs, now, curved=False, kind=kinds - 2).now
     descent = descend(programs, now, curved=True, kind=kinds - 1)
     if not programs.agrees(descent.now) and programs.forget():  # the problem's constants have changed
         problem = problem if noise is None else problem.replaced(noise=noise)
-        return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
+        return optimal_trajectories(
+            problem, x0, u, iterations, rivals, progress, until - time.thread_time(), softer_first
+        )
     return descent.optimum(noise)
 
 
-def _from_softer_costs(
-    problem: Problem, start: float, under: Callable[..., Path], descend: Callable[..., "_Descent"], u: ControlPath
-) -> ControlPath:
-    """Controls that were optimal as long as ρ‖u‖² was added to a cost of controls with kinks, ρ falling from a start.
+class SofterCost(NamedTuple):
+    """A cost that is softer than that of the problem."""
 
-    Across a kink or between limits an optimum jumps, which quadratic models do not tell.
+    softness: float = 0.0  # ρ of the cost ρ‖u‖² that is added where costs of controls have kinks
+    widening: float = 1.0  # factor of the distances at which a cost of time ends
+
+
+def _softer_costs(problem: Problem) -> list[SofterCost]:
+    """Softer costs, each closer to that of the problem; none if it needs none.
+
+    Across a kink of a cost of controls, or between limits, an optimum jumps, and far from its goal a cost of time has
+    no slope: quadratic models tell neither.
+    """
+    softness, widening = _softness_of_kinks(problem), _widening_of_time(problem)
+    if softness:
+        stages = len(SOFTNESS)
+        return [SofterCost(share * softness, widening ** (1 - (k + 1) / stages)) for k, share in enumerate(SOFTNESS)]
+    stages = math.ceil(math.log(widening) / math.log(NARROWING))
+    return [SofterCost(widening=widening ** (1 - k / stages)) for k in range(stages)]
+
+
+def _from_softer_costs(
+    problem: Problem,
+    stages: Sequence[SofterCost],
+    under: Callable[..., Path],
+    descend: Callable[..., "_Descent"],
+    u: ControlPath,
+) -> ControlPath:
+    """Controls that are optimal for the last of some softer costs, each sought from those of the one before.
 
     Source: Bertrand, Epenoy, "New smoothing techniques for solving bang-bang optimal control problems", Optimal Control
     Applications and Methods 2002.
     """
     softer = copied(problem)
-    costs = softer.cost.nonquadratic
-    assert costs is not None
-    softness = costs.softness
+    costs, time = softer.cost.nonquadratic, time_cost_of(softer.cost)
     programs = StepPrograms(softer, STEP_SIZES)
-    for share in SOFTNESS:
-        softness.fill_(share * start)
+    for stage in stages:
+        if costs is not None:
+            costs.softness.fill_(stage.softness)
+        if time is not None:
+            time.widening.fill_(stage.widening)
         u = descend(programs, under(u, softer), curved=False, kind=0).now.u
     return u
+
+
+@torch.no_grad()
+def _widening_of_time(problem: Problem) -> float:
+    """The distance of X₀ from the goal, in those at which a cost of time ends; 1 without such a cost."""
+    if time_cost_of(problem.cost) is None:
+        return 1.0
+    x0 = problem.initial_states.sample(WIDENING_STATES, torch.Generator().manual_seed(0)).to(problem.goal)
+    return max(float(squared_distance(problem.cost, x0).mean().sqrt()), 1.0)
 
 
 def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:

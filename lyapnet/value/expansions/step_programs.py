@@ -130,13 +130,16 @@ class StepPrograms(StepDerivatives):
         return known[key]
 
     def _cache_key(self) -> tuple[Any, ...]:
-        """The key of the programs: problems with the same findings may differ in horizon and controls."""
-        controls, m = self.problem.controls, self.problem.system.m
+        """The key of the programs: problems with the same findings may differ in horizon and controls.
+
+        Programs run any number of steps.
+        """
+        controls, m, horizon = self.problem.controls, self.problem.system.m, self.problem.horizon
         sizes = torch.tensor([0.1, 1.0, 10.0, 1e4], dtype=torch.float64)
         tried = sizes[:, None, None] * torch.randn(4, 4, m, generator=torch.Generator().manual_seed(0)).double()
         shapes = tuple(tensor.shape for tensor in state_of(self.problem))
         kept = tuple(controls.project(tried).flatten().tolist())
-        return self.problem.horizon, type(controls), kept, self._search.step_sizes, shapes
+        return horizon.dt, horizon.method, type(controls), kept, self._search.step_sizes, shapes
 
 
 class _SearchStep(nn.Module):

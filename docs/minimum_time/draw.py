@@ -19,7 +19,8 @@ problem, dt = controller.problem, controller.horizon.dt
 X0 = problem.initial_states
 
 
-def least_time(x):
+def least_time(x: torch.Tensor) -> torch.Tensor:
+    """T* from states (b, 2)."""
     position, velocity = x.unbind(-1)
     side = torch.where(position + velocity * velocity.abs() / 2 >= 0, 1.0, -1.0)
     return side * velocity + 2 * (side * position + velocity**2 / 2).clamp_min(0).sqrt()

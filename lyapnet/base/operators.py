@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
-NUMBERS, BOUNDS = "numbers", "bounds"
+NUMBERS, BOUNDS, MINIMA = "numbers", "bounds", "minima"
 """The readers that have instructions or rules of their own for some functions."""
 
 _READERS = ContextVar("readers for which their functions are traced as operators", default=frozenset[str]())
@@ -23,7 +23,8 @@ WHOLE = set[Any]()
 def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
     """Within it, each function of a reader is traced as one operator (on=True) or as it is written (default).
 
-    Those of the kernel for numbers are made by `operator`; that of bounds is lyapnet.prover.rounding.rounded.
+    Those of the kernel for numbers are made by `operator`; those of bounds are lyapnet.prover.rounding.rounded and, of
+    minima, lyapnet.task.cost.minimum.traced_minimum.
     """
     token = _READERS.set(_READERS.get() | {reader} if on else _READERS.get() - {reader})
     try:

@@ -98,7 +98,7 @@ class RiseCondition(DecreaseCondition):
     def __init__(self, closed_loop: ClosedLoop, beta: float, delta: float, problem: Problem):
         super().__init__(closed_loop, beta, delta)
         cost, limits = closed_loop.cost, problem.controls.limits
-        if any(getattr(getattr(cost, name), "__func__", None) is not getattr(Cost, name) for name in FIXED_METHODS):
+        if cost.has_methods_of_its_own:
             raise UsageError(
                 f"Expected ℓ = q + (u − u*)ᵀR(u − u*), got {type(cost).__name__} with its own `running` or `control`; "
                 "leave these methods as they are, and put terms in x into `state`."
@@ -126,9 +126,6 @@ class RiseCondition(DecreaseCondition):
     def height(self, t: Time, x: State) -> PerState:
         """W(t, x) = β V(t, x) − δ(T − t)."""
         return self.alpha * self.V(t, x) - self.delta * (self.duration - t)
-
-
-FIXED_METHODS = ("running", "smooth_running", "beside", "best_control", "control")
 
 
 def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: ControlSet) -> PerState:

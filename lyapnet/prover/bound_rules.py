@@ -16,13 +16,14 @@ from lyapnet.prover import taylor
 from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
 from lyapnet.prover.composed_rules import COMPOSED, on_forms
 from lyapnet.prover.linear_systems import LINEAR_SYSTEMS
+from lyapnet.prover.minima import MINIMA
 from lyapnet.prover.rounding import ROUNDED
 from lyapnet.prover.taylor import TaylorForm
 
 aten = torch.ops.aten
 
 Rule = Callable[..., Any]
-RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS}
+RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS, **MINIMA}
 """Operator ↦ its rule: a function of its arguments, some of them Taylor forms, that returns a form or a tensor."""
 
 

@@ -24,6 +24,7 @@ from torch.fx.node import map_arg
 from torch.utils._pytree import tree_map_only
 
 from lyapnet.base.errors import LyapnetError, UsageError, one_line
+from lyapnet.base.operators import MINIMA, as_operators
 from lyapnet.base.types import Corner, Corners, OnBoxes
 from lyapnet.graphs.tracing import trace
 from lyapnet.prover import taylor
@@ -68,7 +69,7 @@ class BoundedFunction:
         share = torch.rand(TRACE_POINTS, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            with rounding(counted=not exact):
+            with rounding(counted=not exact), as_operators(MINIMA):
                 graph = trace(function, first, others)
             self.graph = copy.deepcopy(graph)  # a copy, so that nobody else changes its constants
         except LyapnetError as error:

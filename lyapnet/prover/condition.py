@@ -11,7 +11,14 @@ from lyapnet.base.types import Corner, PerState, State, Time
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.task.constraints import Constraints
-from lyapnet.value.calculus import ValueFunction, gradients, time_derivative
+from lyapnet.value.calculus import (
+    ValueFunction,
+    drift_lie_derivative,
+    gradients,
+    input_lie_derivative,
+    time_derivative,
+)
+from lyapnet.value.policy import ValuePolicy
 
 
 class DecreaseCondition(nn.Module):
@@ -62,12 +69,36 @@ class DecreaseCondition(nn.Module):
         return self.parts(t, x)[0]
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
-        """(c, W, Ẇ) with Ẇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| − δ = c − α ℓ; so c ≤ 0 implies Ẇ ≤ 0 if ℓ ≥ 0."""
-        loop, u = self.closed_loop, self.closed_loop.policy(t, x)
-        fall = time_derivative(self.V, loop.system, t, x, u)
-        if self.disturbance is not None:
-            fall = fall + self.worst_push(self.V.value_and_state_gradient(t, x)[1])
-        return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
+        """(c, W, Ẇ) with Ẇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| − δ = c − α ℓ; so c ≤ 0 implies Ẇ ≤ 0 if ℓ ≥ 0.
+
+        Where u is known as a minimum, the third part may be larger than Ẇ.
+        """
+        paid, fall = self.decrease(t, x)
+        return paid - self.delta, self.height(t, x), fall - self.delta
+
+    def decrease(self, t: Time, x: State) -> tuple[PerState, PerState]:
+        """(V̇ + αℓ, V̇ or more) with V̇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i|.
+
+        If u minimises ℓ + bᵀu, then ℓ = q + h − bᵀu with the minimum h, a concave function of b whose slope is u. So
+
+            V̇ + αℓ = V_t + V_xᵀf + (gᵀV_x − αb)ᵀu + α(q + h),     V̇ ≤ V_t + V_xᵀf + (gᵀV_x − b)ᵀu + h,
+
+        as ℓ ≥ q. The law's b is gᵀV_x, so that errors of u in bounds hardly count.
+        """
+        loop = self.closed_loop
+        least = loop.policy.least(t, x) if isinstance(loop.policy, ValuePolicy) else None
+        if least is None:
+            u = loop.policy(t, x)
+            fall = self._pushed(time_derivative(self.V, loop.system, t, x, u), t, x)
+            return fall + self.alpha * loop.cost.running(x, u), fall
+        V_x = self.V.value_and_state_gradient(t, x)[1]
+        drift = self._pushed(gradients(self.V, t, x)[0] + drift_lie_derivative(loop.system, x, V_x), t, x)
+        slope, (u, b, value) = input_lie_derivative(loop.system, x, V_x), least
+        paid = drift + ((slope - self.alpha * b) * u).sum(-1) + self.alpha * (loop.cost.state(x) + value)
+        return paid, drift + ((slope - b) * u).sum(-1) + value
+
+    def _pushed(self, fall: PerState, t: Time, x: State) -> PerState:
+        return fall if self.disturbance is None else fall + self.worst_push(self.V.value_and_state_gradient(t, x)[1])
 
     def worst_push(self, slope: State) -> PerState:
         """Σ_i w_i |∂V/∂x_i|, the most that a disturbance adds to V̇."""

@@ -10,6 +10,7 @@ from lyapnet.base.interpolation import Curve
 from lyapnet.base.linear_algebra import apply, convex_or, multiply
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.task.cost import Cost
+from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.problem import Problem, Response
 from lyapnet.task.sets import ControlSet, about_control
 from lyapnet.task.systems import ControlAffineSystem
@@ -31,6 +32,14 @@ class PolicyOutput(NamedTuple):
     state_gradient: State  # V_x
 
 
+class LeastCost(NamedTuple):
+    """A control as a minimum: (u − u*)ᵀR(u − u*) + s(u) is value − bᵀu."""
+
+    u: Control
+    b: Control
+    value: PerState
+
+
 class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
@@ -49,6 +58,10 @@ class ValuePolicy(nn.Module):
     def with_value(self, t: Time, x: State) -> PolicyOutput:
         """u, V and V_x; a law that needs V_x for u computes it only once."""
         return PolicyOutput(self(t, x), *self.V.value_and_state_gradient(t, x))
+
+    def least(self, t: Time, x: State) -> LeastCost | None:
+        """What u costs, as bounds know it; None where they read u(t, x) and ℓ(x, u) as they are written."""
+        return None
 
 
 class HJBPolicy(ValuePolicy):
@@ -71,6 +84,17 @@ class HJBPolicy(ValuePolicy):
             return self.cost.best_control(self.controls, R, about_control(R, b, rest))
         u = -0.5 * self.cost.solve_R(x, b)  # a constant R is inverted only once
         return u if rest is None else u + rest
+
+
+    def least(self, t: Time, x: State) -> LeastCost | None:
+        if type(self).forward is not HJBPolicy.forward or type(self)._minimise is not HJBPolicy._minimise:
+            return None
+        rest, R = self.cost.rest_at(x), self.cost.R(x)
+        b = about_control(R, input_lie_derivative(self.system, x, self.V.value_and_state_gradient(t, x)[1]), rest)
+        minimum = self.cost.least(self.controls, R, b)
+        if minimum is None:
+            return None
+        return LeastCost(minimum.u, b, minimum.value if rest is None else minimum.value + quadratic_form(R, rest))
 
 
 class SontagPolicy(ValuePolicy):

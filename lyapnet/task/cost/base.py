@@ -3,7 +3,6 @@
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -14,6 +13,13 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, solve
 from lyapnet.base.types import Control, ControlMatrix, Matrix, PerState, State
 from lyapnet.task.cost.control_costs import ControlCosts
+from lyapnet.task.cost.minimum import (
+    Minimum,
+    best_control,
+    is_quadratic_between_limits,
+    least_over,
+    traced_minimum,
+)
 from lyapnet.task.sets import ControlSet
 
 BUFFERS = ("goal", "rest", "R_constant", "R_inverse")  # properties of a cost; each may be None
@@ -110,8 +116,24 @@ class Cost(nn.Module, ABC):
             W: (*batch, m, m), symmetric positive definite.
             b: (*batch, m).
         """
-        minimise = controls.minimise if self.nonquadratic is None else partial(self.nonquadratic.minimise, controls)
-        return minimise(W, b)
+        minimum = traced_minimum(self.nonquadratic, controls, W, b)
+        return best_control(self.nonquadratic, controls, W, b) if minimum is None else minimum.u
+
+    def least(self, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum | None:
+        """The same control and the minimum; None where bounds read the control as it is written.
+
+        They do so without s and without a ball, and if a class has methods that differ from ℓ = q + uᵀWu + s(u).
+        """
+        if is_quadratic_between_limits(self.nonquadratic, controls) or self.has_methods_of_its_own:
+            return None
+        minimum = traced_minimum(self.nonquadratic, controls, W, b)
+        return least_over(self.nonquadratic, controls, W, b) if minimum is None else minimum
+
+    @property
+    def has_methods_of_its_own(self) -> bool:
+        """Whether methods that follow from q, R and s are those of a subclass."""
+        methods = ("running", "smooth_running", "beside", "best_control", "control")
+        return any(getattr(getattr(self, name), "__func__", None) is not getattr(Cost, name) for name in methods)
 
     def solve_R(self, x: State, v: Control) -> Control:
         """R(x)⁻¹v."""

@@ -1,0 +1,307 @@
+"""Bounds of min over u ∈ U of uᵀWu + bᵀu + s(u) and of the u where it is: the rule of lyapnet.task.cost.minimum.
+
+The minimum h(b) is concave and u(b) its slope, so that
+
+    u(b) = u(b₀) + D(b − b₀),     h(b) = h(b₀) + u(b₀)ᵀ(b − b₀) + ½ (b − b₀)ᵀD'(b − b₀)
+
+with means D and D' of the derivative u_b on the way from b₀ to b. u_b is symmetric, and −(2W)⁻¹ ≤ u_b ≤ 0, for every
+convex s and U. Two cases are known more closely, on a box of b:
+
+* Each control by itself, for a diagonal W, costs Σ σᵢ(uᵢ) and limits: u_b is −1/(2Wᵢᵢ + σᵢ''(uᵢ)), or 0 in the kink of
+  |uᵢ| and at a limit. The curvature of all of lyapnet's costs is monotone in |u|.
+* ‖u‖ and a ball, for W a multiple of the identity: u is −b by a function of ‖b‖.
+
+If W depends on the point too, W = W₀ + Δ, then u is the minimiser for W₀ and b + 2Δu, and |h − h₀| ≤ max |uᵀΔu|.
+
+The law computes u by Newton's method. It is taken to be as exact as this: u is FORWARD · |u| from the minimiser for a b
+that is off by BACKWARD of the size of b and 2Wu. At the centre of each box that is checked, by the conditions of an
+optimum; a box where it does not hold has no bounds.
+
+Sources: Rockafellar, Convex Analysis, 1970, § 23, 26 (conjugates); Bauschke, Combettes, Convex Analysis and Monotone
+Operator Theory in Hilbert Spaces, 2017, § 4 (firmly nonexpansive maps).
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import OnBoxes
+from lyapnet.prover import taylor
+from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
+from lyapnet.task.ball import ControlBall
+from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts, SeparableCost
+from lyapnet.task.cost.minimum import LEAST, known_as, least_over
+from lyapnet.task.sets import ControlSet, Unbounded
+
+FORWARD, BACKWARD = 1e-10, 1e-9  # see above; float64 has 1e-16, which R of a condition of 1e5 makes 1e-11
+ROOM = 1e-9  # of a slope, for the rounding of its bounds
+
+
+class _Program(NamedTuple):
+    """min over u ∈ U of uᵀWu + bᵀu + s(u), a set of them for each box: |b − middle| ≤ reach."""
+
+    costs: ControlCosts | None  # s
+    controls: ControlSet  # U
+    W: OnBoxes  # (boxes, m, m)
+    middle: OnBoxes  # (boxes, m)
+    reach: OnBoxes  # (boxes, m)
+    size: OnBoxes  # a bound of |uᵢ|, (boxes, m)
+
+    @property
+    def radial(self) -> bool:
+        """Whether s and U look at ‖u‖ alone. Those of a single control are kinks and limits."""
+        ball = isinstance(self.controls, ControlBall) or (self.costs is not None and bool(self.costs.norms))
+        return ball and self.middle.shape[-1] > 1
+
+    @property
+    def kinks(self) -> Tensor:
+        """w of s = w‖u‖ + …, or of s = Σ wᵢ|uᵢ| + …, (m,)."""
+        kinked = [] if self.costs is None else self.costs.kinked
+        return sum((cost.weight for cost in kinked), self.middle.new_zeros(self.middle.shape[-1]))
+
+    @property
+    def smooth(self) -> list[SeparableCost]:
+        """The other costs of each control."""
+        return [] if self.costs is None else [c for c in self.costs.separable if not isinstance(c, AbsoluteCost)]
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """(lower, upper), (m,), of the smallest box around U."""
+        low, high = self.controls.limits or (torch.tensor(-torch.inf), torch.tensor(torch.inf))
+        return low.to(self.middle).expand(len(self.middle[0])), high.to(self.middle).expand(len(self.middle[0]))
+
+    @property
+    def is_diagonal(self) -> bool:
+        """Whether W is diagonal on all boxes."""
+        return not bool((self.W - torch.diag_embed(self.W.diagonal(dim1=-2, dim2=-1))).any())
+
+    def slope(self, u: OnBoxes, side: int) -> OnBoxes:
+        """The slope of s on one side of u, −1 or 1, where each control costs by itself; ±∞ at a limit."""
+        low, high = self.limits
+        total = self.kinks * torch.where(side * u >= 0, side, -side)
+        for cost in self.smooth:
+            total = total + _inside(cost, "slope", u, u.sign() * torch.inf)
+        return torch.where(u >= high, torch.inf, total) if side > 0 else torch.where(u <= low, -torch.inf, total)
+
+
+def _inside(cost: SeparableCost, name: str, u: OnBoxes, beyond: Any) -> OnBoxes:
+    """A method of a cost; another value from its open limit on, if there is one."""
+    end = cost.open_limit
+    if end is None:
+        return getattr(cost, name)(u)
+    inside = u.abs() < end
+    return torch.where(inside, getattr(cost, name)(torch.where(inside, u, 0.0)), beyond)
+
+
+def least(W: Any, b: Any, named: str) -> TaylorForm:
+    """(u, h), (m + 1,), of the s and the U with this description.
+
+    Args:
+        W: (m, m), a form or constant.
+        b: (m,), a form or constant.
+    """
+    b = b if isinstance(b, TaylorForm) else taylor.constant_form(b, W)
+    low, high = b.interval()
+    known = (low.isfinite() & high.isfinite()).all(-1, keepdim=True)
+    middle = torch.where(known, b.center, 0.0)
+    reach = torch.where(known, torch.maximum(high - middle, middle - low), 1.0)
+    W, spread, definite = _matrices(W, b)
+    costs, controls = known_as(named, b.radius.device)
+    program = _Program(costs, controls, W, middle, reach, _sizes(controls, W, spread, middle.abs() + reach))
+    u, value = least_over(costs, controls, W, middle)
+    forces = 2 * apply(W.abs(), program.size) + middle.abs() + reach + program.kinks
+    found = _is_minimum(program, u, BACKWARD * forces)
+    off = 2 * BACKWARD * forces + 2 * (1 + ROOM) * apply(spread, program.size)
+    far, near = reach + off, FORWARD * program.size
+    D, doubt = _slopes(program._replace(reach=far))
+    y = b.with_parts(torch.cat([torch.zeros_like(b.terms[:1]), b.terms[1:]]), b.radius)
+    Dy = _linear(D, y)
+    radius = Dy.radius + apply(D.abs(), off) + apply(doubt, far) + near
+    law = Dy.with_parts(torch.cat([u[None], Dy.terms[1:]]), radius * (1 + ROOM)).with_rounding()
+    curved, straight = taylor.multiply(y, Dy), y.with_parts(y.terms * u, y.radius * u.abs()).with_rounding()
+    h = taylor.add(straight, curved.with_parts(curved.terms / 2, curved.radius / 2)).with_rounding(len(u[0]))
+    error = far * apply(doubt, far) / 2 + program.size * apply(spread, program.size)
+    error = error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + 32 * EPSILON * program.size) * forces
+    terms, radius = h.terms.sum(-1, keepdim=True), (h.radius + error * (1 + ROOM)).sum(-1, keepdim=True)
+    h = h.with_parts(torch.cat([terms[:1] + value[:, None], terms[1:]]), radius).with_rounding()
+    terms, radius = torch.cat([law.terms, h.terms], -1), torch.cat([law.radius, h.radius], -1)
+    certain = known & definite & found & radius.isfinite().all(-1, keepdim=True) & terms.isfinite().all(0).all(-1, keepdim=True)
+    return b.with_parts(torch.where(certain, terms, 0.0), torch.where(certain, radius, torch.inf))
+
+
+def _matrices(W: Any, like: TaylorForm) -> tuple[OnBoxes, OnBoxes, Tensor]:
+    """(W₀, a bound of |W − W₀|, whether W is positive definite on the box (boxes, 1)); where it is not, W₀ is 1."""
+    boxes, m = like.radius.shape
+    if isinstance(W, TaylorForm):
+        center, spread = W.center, W.spread + W.radius + 4 * len(W.terms) * EPSILON * W.magnitude
+    else:
+        center, spread = W.to(like.radius).expand(boxes, m, m), like.radius.new_zeros(boxes, m, m)
+    middle = (center + center.mT) / 2
+    spread = torch.maximum(spread, spread.mT) + (center - middle).abs()
+    finite = (center.isfinite() & spread.isfinite()).all((-2, -1), keepdim=True)
+    one = torch.eye(m).to(middle)
+    middle, spread = torch.where(finite, middle, one), torch.where(finite, spread, 0.0)
+    definite = finite & (_stiffness(middle, spread)[..., None] > 0)
+    return torch.where(definite, middle, one), torch.where(definite, spread, 0.0), definite[..., 0]
+
+
+def _stiffness(W: OnBoxes, spread: OnBoxes) -> OnBoxes:
+    """A lower bound of the least eigenvalue of W, (boxes, 1)."""
+    size = torch.linalg.matrix_norm(W)
+    return (torch.linalg.eigvalsh(W)[..., 0] - 1e-12 * size - torch.linalg.matrix_norm(spread) * (1 + ROOM))[:, None]
+
+
+def _sizes(controls: ControlSet, W: OnBoxes, spread: OnBoxes, b: OnBoxes) -> OnBoxes:
+    """A bound of |uᵢ|: its limits; and ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W, if U contains 0."""
+    free = b.norm(dim=-1, keepdim=True) * (1 + ROOM) / (2 * _stiffness(W, spread))
+    if controls.limits is None:
+        return free.expand_as(b)
+    low, high = (side.to(b) for side in controls.limits)
+    if bool((low > 0).any() | (high < 0).any()):
+        free = torch.full_like(free, torch.inf)
+    return torch.minimum(free, torch.maximum(low.abs(), high.abs())).expand_as(b)
+
+
+def _linear(D: OnBoxes, y: TaylorForm) -> TaylorForm:
+    """Dy with a matrix D for each box."""
+    y = y.with_rounding(2 * D.shape[-1])  # as in taylor.matrix_product
+    return y.with_parts(apply(D, y.terms), apply(D.abs(), y.radius) + TINY)
+
+
+def _is_minimum(program: _Program, u: OnBoxes, tolerance: OnBoxes) -> Tensor:
+    """Whether u is the minimiser for b in the middle, up to FORWARD and BACKWARD, (boxes, 1)."""
+    near, slope = FORWARD * program.size, 2 * apply(program.W, u) + program.middle
+    if not program.radial:
+        bend = 2 * program.W.diagonal(dim1=-2, dim2=-1) * near
+        above, below = slope + bend + program.slope(u + near, 1), slope - bend + program.slope(u - near, -1)
+        (low, high) = program.limits
+        holds = (above >= -tolerance) & (below <= tolerance) & (u >= low - near) & (u <= high + near)
+        return holds.all(-1, keepdim=True)
+    w, radius = program.kinks[0], program.limits[1][0]
+    size, most = u.norm(dim=-1, keepdim=True), tolerance.amax(-1, keepdim=True)
+    still = size <= near[:, :1]
+    pull = w / torch.where(still, 1.0, size)
+    rim = (-(slope * u).sum(-1, keepdim=True) / torch.where(still, 1.0, size * size)).maximum(pull)
+    rest = slope + torch.where(size >= radius - near[:, :1], rim, pull) * u
+    moving = (rest.norm(dim=-1, keepdim=True) <= most) & (size <= radius + near[:, :1])
+    return torch.where(still, program.middle.norm(dim=-1, keepdim=True) <= w + most, moving)
+
+
+def _slopes(program: _Program) -> tuple[OnBoxes, OnBoxes]:
+    """(D, a bound of |u_b − D|) on the box, (boxes, m, m) each."""
+    W, diagonal = program.W, program.W.diagonal(dim1=-2, dim2=-1)
+    if program.is_diagonal:
+        G = torch.diag_embed(1 / (2 * diagonal))
+    else:
+        G = torch.linalg.inv(2 * W)
+        G = (G + G.mT) / 2
+    root = G.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    across = root[..., :, None] * root[..., None, :]
+    low, high = -(G + across) / 2, (across - G) / 2
+    closer = None
+    if program.is_diagonal and not program.radial:
+        closer = tuple(map(torch.diag_embed, _slopes_of_each(program, 2 * diagonal)))
+    elif program.is_diagonal and not bool((diagonal != diagonal[..., :1]).any()):
+        closer = _slopes_of_radius(program, 2 * diagonal[..., 0])
+    if closer is not None:
+        low, high = torch.maximum(low, closer[0]), torch.minimum(high, closer[1])
+    room = ROOM * across
+    return (low + high) / 2, (high - low) / 2 + room
+
+
+def _slopes_of_each(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]:
+    """The range of ∂uᵢ/∂bᵢ = −1/(rᵢ + σᵢ''(uᵢ)) for a diagonal W, (boxes, m) each.
+
+    Args:
+        bend: r = 2Wᵢᵢ.
+    """
+    b_low, b_high = program.middle - program.reach, program.middle + program.reach
+    low, high = program.limits
+    u = least_over(program.costs, program.controls, program.W, program.middle).u
+    step = program.reach / bend * (1 + ROOM) + FORWARD * program.size
+    u_low, u_high = (u - step).clamp(low, high), (u + step).clamp(low, high)
+    most = torch.maximum(u_low.abs(), u_high.abs())
+    least = torch.where((u_low <= 0) & (u_high >= 0), 0.0, torch.minimum(u_low.abs(), u_high.abs()))
+    flat, sharp = torch.zeros_like(bend), torch.zeros_like(bend)
+    for cost in program.smooth:  # the curvature of each of them is monotone in |u|
+        ends = torch.stack([_inside(cost, "curvature", end, torch.inf) for end in (least, most)])
+        flat, sharp = flat + ends.amin(0), sharp + ends.amax(0)
+    steep, mild = -1 / (bend + flat), -1 / (bend + sharp)
+    still, may_be = torch.zeros_like(bend, dtype=torch.bool), torch.zeros_like(bend, dtype=torch.bool)
+    w = program.kinks
+    for start, end in ((-w, w), *_at_limits(program, bend)):  # intervals of b on which u is constant
+        room = ROOM * torch.maximum(start.abs(), end.abs()).nan_to_num(0, 0, 0)
+        still = still | ((b_low >= start + room) & (b_high <= end - room) & (end > start))
+        may_be = may_be | ((b_low <= end + room) & (b_high >= start - room) & (end > start))
+    return torch.where(still, 0.0, steep), torch.where(may_be, 0.0, mild)
+
+
+def _at_limits(program: _Program, bend: OnBoxes) -> list[tuple[OnBoxes, OnBoxes]]:
+    """The intervals of b, (boxes, m) each, on which u is at its upper and at its lower limit."""
+    low, high = program.limits
+    free = program._replace(controls=Unbounded())
+    ends = list[tuple[OnBoxes, OnBoxes]]()
+    everywhere = torch.full_like(bend, torch.inf)
+    upper, lower = high.expand_as(bend), low.expand_as(bend)
+    at_upper = torch.where(upper.isfinite(), -(bend * upper + free.slope(upper, -1)), -torch.inf)
+    at_lower = torch.where(lower.isfinite(), -(bend * lower + free.slope(lower, 1)), torch.inf)
+    ends.append((-everywhere, at_upper))
+    ends.append((at_lower, everywhere))
+    return ends
+
+
+def _slopes_of_radius(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]:
+    """The range of u_b for u = −b a(β)/β, β = ‖b‖, a = min(max(β − w, 0)/r, radius), (boxes, m, m) each:
+
+        u_b = −a/β + (a/β − a') n nᵀ,     n = b/β.
+
+    Args:
+        bend: r, W being r/2 times the identity.
+    """
+    w, radius = program.kinks[0], program.limits[1][0]
+    b_low, b_high = program.middle - program.reach, program.middle + program.reach
+    most = torch.maximum(b_low.abs(), b_high.abs())
+    least = torch.where((b_low <= 0) & (b_high >= 0), 0.0, torch.minimum(b_low.abs(), b_high.abs()))
+    near, far = least.norm(dim=-1) * (1 - ROOM), most.norm(dim=-1) * (1 + ROOM) + TINY
+    full = (w + bend * radius).clamp(max=1e300)  # ‖b‖ from which ‖u‖ is the radius of the ball
+
+    def share(beta: Tensor) -> Tensor:
+        return torch.minimum((beta - w).clamp_min(0) / bend, radius) / beta.clamp_min(TINY)
+
+    ends = torch.stack([share(near), share(far)])
+    ends = torch.where(w == 0, torch.where(near == 0, torch.stack([1 / bend, ends[1]]), ends), ends)
+    peak = torch.where((near <= full) & (far >= full), share(full), ends.amax(0))
+    turn = ends.amin(0) * (1 - ROOM), torch.maximum(peak, ends.amax(0)) * (1 + ROOM)
+    active, may_be = (near >= w) & (far <= full * (1 - ROOM)), (far >= w) & (near <= full * (1 + ROOM))
+    grow = torch.where(active, 1 / bend, 0.0), torch.where(may_be, 1 / bend, 0.0)
+    # nᵢ falls with |b_j|, and its sign is that of bᵢ
+    others = ((least**2).sum(-1, keepdim=True) - least**2).clamp_min(0), (most**2).sum(-1, keepdim=True) - most**2
+    n_high = torch.where(b_high >= 0, _direction(b_high, others[0]), _direction(b_high, others[1]))
+    n_low = torch.where(b_low <= 0, _direction(b_low, others[0]), _direction(b_low, others[1]))
+    n = (n_low - ROOM).clamp(-1, 1), (n_high + ROOM).clamp(-1, 1)
+    nn = _products((n[0][..., :, None], n[1][..., :, None]), (n[0][..., None, :], n[1][..., None, :]))
+    square = torch.eye(len(b_low[0]), dtype=torch.bool).to(b_low.device)
+    crosses = (n[0] <= 0) & (n[1] >= 0)
+    nn = torch.where(square & ~crosses[..., None], nn[0], torch.where(square, 0.0, nn[0])), nn[1]
+    gap = turn[0] - grow[1], turn[1] - grow[0]
+    gap = tuple(torch.where(active & (w == 0), 0.0, side)[:, None, None] for side in gap)
+    low, high = _products(gap, nn)
+    one = square.to(b_low)
+    return low - turn[1][:, None, None] * one, high - turn[0][:, None, None] * one
+
+
+def _direction(b: OnBoxes, others: OnBoxes) -> OnBoxes:
+    """bᵢ/√(bᵢ² + others), and ±1 without others."""
+    return b / (b * b + others).sqrt().clamp_min(TINY)
+
+
+def _products(x: tuple[Tensor, Tensor], y: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The range of products of two intervals."""
+    ends = torch.stack([a * b for a in x for b in y])
+    return ends.amin(0), ends.amax(0)
+
+
+MINIMA = {LEAST: least}
+"""Operator ↦ its rule."""

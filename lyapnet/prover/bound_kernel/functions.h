@@ -311,4 +311,26 @@ struct Clamp {
     M defined(V, V) const { return always(); }
 };
 
+// v up to 1, and 2√v − 1 beyond: the minimum of a quadratic cost in a ball, as a function of ‖b‖²
+struct WithinBall {
+    static constexpr bool SMOOTH = false;
+    Jet jet(V v) const {
+        const V r = root(larger(v, splat(1)));
+        return {{v > 1 ? 2 * r - 1 : v, 1 / r}};
+    }
+    int stationary(V a, V, V, V *at) const { return at[0] = 1 / (a * a), 1; }
+    M defined(V, V) const { return always(); }
+};
+
+// its slope
+struct SlopeWithinBall {
+    static constexpr bool SMOOTH = false;
+    Jet jet(V v) const {
+        const V r = 1 / root(larger(v, splat(1)));
+        return {{r, v > 1 ? -0.5 * r * r * r : splat(0)}};
+    }
+    int stationary(V a, V, V, V *at) const { return at[0] = splat(1), at[1] = 1 / each<std::cbrt>(4 * a * a), 2; }
+    M defined(V, V) const { return always(); }
+};
+
 }  // namespace

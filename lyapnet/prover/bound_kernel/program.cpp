@@ -87,7 +87,10 @@ void matrix_product(const Block &block, const int *&code) {
     }
 }
 
-enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, ABSOLUTE, LEAKY, CLAMP };
+enum Function {
+    EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, ABSOLUTE, LEAKY, CLAMP, WITHIN_BALL,
+    SLOPE_WITHIN_BALL
+};
 
 void apply_one(
     const Block &block, const Powers &powers, int function, const Entry &x, const Range &ends, const Entry &out,
@@ -108,6 +111,8 @@ void apply_one(
         case ABSOLUTE: return apply(block, powers, x, ends, out, Absolute{});
         case LEAKY: return apply(block, powers, x, ends, out, Leaky{p});
         case CLAMP: return apply(block, powers, x, ends, out, Clamp{p, q});
+        case WITHIN_BALL: return apply(block, powers, x, ends, out, WithinBall{});
+        case SLOPE_WITHIN_BALL: return apply(block, powers, x, ends, out, SlopeWithinBall{});
     }
 }
 

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.fx.node import map_arg
 from torch.utils._pytree import tree_map_only
 
-from lyapnet.prover.bound_kernel import branch_rules, rules
+from lyapnet.prover.bound_kernel import branch_rules, minima, rules
 from lyapnet.prover.bound_kernel.program import Forms, Program
 from lyapnet.prover.bound_kernel.rules import as_forms
 from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_SHAPE
 
 aten = torch.ops.aten
-RULES = {**rules.RULES, **branch_rules.RULES}
+RULES = {**rules.RULES, **branch_rules.RULES, **minima.RULES}
 
 
 def write_graph(program: Program, nodes: Sequence[Any], constants: dict[Any, Any]) -> list[Forms]:

@@ -65,6 +65,7 @@ def certify(
         run.require_used_by(claim)
         if not claim.allows_noise:
             require_no_noise(controller.problem, claim.kind)
+        claim.require_law(controller)
         if controller.problem.follows_reference and not claim.allows_reference:
             raise UsageError(
                 f"Expected a goal that stays for a {claim.kind} certificate, got a reference; sampled and statistical "

@@ -182,6 +182,13 @@ class Claim(ABC):
             if check is not None and value is not None:
                 check(value)
 
+    def require_law(self, controller: "Controller") -> None:  # noqa: B027, most claims need nothing of it
+        """Refuse a control law that no claim of this kind can bound, before anything is computed.
+
+        Raises:
+            UsageError: the cost of the controls or their set is none that it takes.
+        """
+
     @abstractmethod
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         """Try to establish the claim for a controller with the resources of a run.

@@ -1,4 +1,4 @@
-"""Checks u(t, x) ∈ U on [0, T] × D for a control set U that the user wrote, by its method `contains`."""
+"""Checks of u(t, x) before a proof: u ∈ U for a control set of a user's own, and u as the minimiser of its costs."""
 
 import logging
 import operator
@@ -19,13 +19,22 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import Boxes, roots
 from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, searched
+from lyapnet.prover.minima import BACKWARD, is_minimum
 from lyapnet.prover.taylor import interval_form
-from lyapnet.value.policy import ValuePolicy
+from lyapnet.task.ball import ControlBall
+from lyapnet.task.cost.control_costs import CONTROL_COSTS, AbsoluteCost
+from lyapnet.task.cost.minimum import description, is_quadratic_between_limits
+from lyapnet.value.policy import HJBPolicy, SampledPolicy, ValuePolicy
 
 POINTS, DESCENTS = 20_000, 20  # where u ∈ U is not proved: points to test, and descent steps from the worst of them
 ROUNDING = 1e-6  # of the largest |u|: how far u may lie outside of U
 BOXES, SECONDS = 2000, 20.0  # limits of the proof
 ASSUMED = "That u stays in U was tested at {} points of [0, T] × D, and is not proved: bounds cannot decide it for {}."
+
+MINIMISED = (
+    "That the computed u is the minimiser, up to {:g} of the slopes that balance there, was tested at {} points of "
+    "[0, T] × D, and is not proved."
+)
 
 
 def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
@@ -45,8 +54,7 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     if not isinstance(policy, ValuePolicy) or not policy.controls.limited or not reaches_own_code(policy.controls):
         return ""
     name, (lower, upper) = type(policy.controls).__name__, domain
-    share = torch.rand(POINTS, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
-    points = lower + (upper - lower) * share
+    points = _random_points(domain)
     with torch.no_grad():
         u = policy(points[:, 0], points[:, 1:])
         room = ROUNDING * float(u.abs().max())
@@ -77,6 +85,97 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     assumed = ASSUMED.format(POINTS, name)
     logging.getLogger(__name__).warning("note: %s", assumed)
     return assumed
+
+
+def require_written_law(loop: ClosedLoop, claim: str) -> None:
+    """Refuse a law that minimises another cost than uᵀRu, or in a ball, for a claim whose bounds read u as written.
+
+    A single control that pays |u| is a closed form.
+
+    Args:
+        claim: the kind of the certificate, for the message.
+
+    Raises:
+        UsageError: the message names the costs and the set.
+    """
+    policy = loop.policy
+    if not isinstance(policy, ValuePolicy) or is_quadratic_between_limits(policy.cost.nonquadratic, policy.controls):
+        return
+    if policy.system.m == 1 and _pays_absolute_values(policy) and not isinstance(policy.controls, ControlBall):
+        return
+    raise UsageError(
+        f"Expected controls that cost uᵀRu, without limits or between them, for a {claim} certificate, got "
+        f"{_in_words(policy)}; a sound certificate takes it, and a statistical one."
+    )
+
+
+def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
+    """Refuse a law whose control bounds do not know as a minimum, nor as it is written.
+
+    Raises:
+        UsageError: the message names the costs and the set, and the law.
+    """
+    policy = loop.policy
+    if not isinstance(policy, ValuePolicy) or is_quadratic_between_limits(policy.cost.nonquadratic, policy.controls):
+        return
+    names, cost = _in_words(policy), policy.cost
+    if description(cost.nonquadratic, policy.controls) is None:
+        raise UsageError(
+            f"Expected costs of controls of lyapnet's own ({', '.join(CONTROL_COSTS)}) between limits or in a ball for "
+            f"a {claim} certificate, got {names}; take one of them, or a statistical certificate."
+        )
+    if type(policy) is HJBPolicy and not cost.has_methods_of_its_own:
+        return
+    if type(policy) is not SampledPolicy or not _pays_absolute_values(policy) or cost.has_methods_of_its_own:
+        raise UsageError(
+            f"Expected the law of rollout.policy=hjb, and a cost whose methods are those of ℓ = q + uᵀRu + s(u), for a "
+            f"{claim} certificate with {names}, got {type(policy).__name__} and {type(cost).__name__}; train with "
+            "rollout.policy=hjb, or take a statistical certificate."
+        )
+
+
+def _pays_absolute_values(policy: ValuePolicy) -> bool:
+    """Whether controls pay |u| beside uᵀRu, or nothing."""
+    costs = policy.cost.nonquadratic
+    return costs is None or all(type(cost) is AbsoluteCost for cost in costs.costs)
+
+
+def _in_words(policy: ValuePolicy) -> str:
+    """The costs of the controls and their set, as in "AbsoluteCost in ControlBox"."""
+    costs = policy.cost.nonquadratic
+    names = [] if costs is None else [type(cost).__name__ for cost in costs.costs]
+    return f"{' and '.join(names) or 'uᵀRu'} in {type(policy.controls).__name__}"
+
+
+def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
+    """Refuse a law that is not the minimum that bounds take it for, at random points of a box of (t, x).
+
+    Returns:
+        A sentence for the claim that says what is assumed of u; empty if bounds read u as it is written.
+
+    Raises:
+        UsageError: at a point u is farther from it than bounds allow for.
+    """
+    policy, points = loop.policy, _random_points(domain)
+    with torch.no_grad():
+        least = policy.least(points[:, 0], points[:, 1:]) if isinstance(policy, ValuePolicy) else None
+        if least is None:
+            return ""
+        R = policy.cost.R(points[:, 1:])
+        right = is_minimum(policy.cost.nonquadratic, policy.controls, R, least.b, least.u)
+    if not bool(right.all()):
+        k = int(right.to(torch.uint8).argmin())
+        raise UsageError(
+            f"Expected u that minimises ℓ + V_xᵀ(f + gu) up to {BACKWARD:g}, got u = {least.u[k].tolist()} at (t, x) = "
+            f"{points[k].tolist()}, where Newton's method has not converged; give controls a larger R."
+        )
+    return MINIMISED.format(BACKWARD, POINTS)
+
+
+def _random_points(domain: tuple[Corner, Corner]) -> Tensor:
+    lower, upper = domain
+    share = torch.rand(POINTS, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
+    return lower + (upper - lower) * share
 
 
 @dataclass

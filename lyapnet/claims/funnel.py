@@ -12,7 +12,7 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import Interrupted, UsageError, signals_taken
 from lyapnet.base.types import Corner, Corners, PerState, Points, State, Value
-from lyapnet.claims.control_sets import check_controls
+from lyapnet.claims.control_sets import check_controls, check_minimum
 from lyapnet.claims.crossing import Violation, beginning_level, crossing_level, find_violation
 from lyapnet.claims.ignorable_states import ignorable_states
 from lyapnet.claims.preconditions import (
@@ -260,11 +260,11 @@ def find_setting(
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
-    assumed = check_controls(condition.closed_loop, domain)
+    tested = check_controls(condition.closed_loop, domain), check_minimum(condition.closed_loop, domain)
     memory.check()
     tell(report, budget, "the least V on the boundary of D")
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
-    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, assumed)
+    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, " ".join(filter(None, tested)))
 
 
 def budget_for_level(budget: Budget) -> Budget:

@@ -107,6 +107,11 @@ class Funnel(Claim):
     states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
     disturbance: Mapping[str, float] | None = option(None, DISTURBANCE, metavar="STATE=W", check=check_disturbance)
 
+    def require_law(self, controller: "Controller") -> None:
+        from lyapnet.claims.control_sets import require_known_minimum
+
+        require_known_minimum(controller.closed_loop, self.kind)
+
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.arguments import box_of, disturbance_of, slack_of
         from lyapnet.claims.funnel import prove_funnel
@@ -150,6 +155,11 @@ class NoisyFunnel(Claim):
         0.0, "a, at which the funnel {V ≤ ρe^(−at)} narrows, in 1/s.", at_least=0, remedy="give it in 1/s"
     )  # fmt: skip
     states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
+
+    def require_law(self, controller: "Controller") -> None:
+        from lyapnet.claims.control_sets import require_written_law
+
+        require_written_law(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.arguments import box_of, slack_of
@@ -196,6 +206,11 @@ class Reach(Claim):
     )  # fmt: skip
     states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
 
+    def require_law(self, controller: "Controller") -> None:
+        from lyapnet.claims.control_sets import require_written_law
+
+        require_written_law(controller.closed_loop, self.kind)
+
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.arguments import box_of, under_noise
         from lyapnet.claims.reach import prove_reach
@@ -233,6 +248,11 @@ class Region(Claim):
         flag="parameter", metavar="NAME=LOWER:UPPER", check=check_parameters,
     )  # fmt: skip
 
+    def require_law(self, controller: "Controller") -> None:
+        from lyapnet.claims.control_sets import require_written_law
+
+        require_written_law(controller.closed_loop, self.kind)
+
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.arguments import box_of, disturbance_of
         from lyapnet.claims.plants import plants_of
@@ -259,6 +279,11 @@ class Tube(Claim):
     share_of_two: ClassVar[float] = 0.5
 
     radius: float | None = option(None, RADIUS, at_least=0, remedy=NORM)
+
+    def require_law(self, controller: "Controller") -> None:
+        from lyapnet.claims.control_sets import require_written_law
+
+        require_written_law(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.tubes.certificate import TubeCertificate

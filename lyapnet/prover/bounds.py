@@ -47,7 +47,8 @@ class BoundedFunction:
             control flow does not depend on values.
         sample: a box (lower, upper) of (t, x), (1 + n,) each; the trace is checked at points of it.
         degree: degree of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
-        exact: ignore mark_rounded (lyapnet.prover.rounding); the bounds then hold in real arithmetic only.
+        exact: ignore mark_rounded (lyapnet.prover.rounding); the bounds then hold in real arithmetic only. Minima over
+            controls, which have no derivative as one operator, are read as they are written.
 
     Attributes:
         graph: the torch operations of the function at one (t, x).
@@ -69,7 +70,7 @@ class BoundedFunction:
         share = torch.rand(TRACE_POINTS, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            with rounding(counted=not exact), as_operators(MINIMA):
+            with rounding(counted=not exact), as_operators(MINIMA, not exact):
                 graph = trace(function, first, others)
             self.graph = copy.deepcopy(graph)  # a copy, so that nobody else changes its constants
         except LyapnetError as error:

@@ -52,8 +52,8 @@ of costs of controls, whose minimum is one operation.
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     """A hash of the code in the folders and of the tracing, compiler flags, torch's version and own operators."""
     found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
-    for module in (tracing, ball, control_costs, minimum):
-        found.update(Path(module.__file__).read_bytes())
+    for file in (tracing.__file__, ball.__file__, control_costs.__file__, minimum.__file__):
+        found.update(Path(str(file)).read_bytes())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):
             content = path.read_bytes()

@@ -21,13 +21,15 @@ Sources: Rockafellar, Convex Analysis, 1970, § 23, 26 (conjugates); Bauschke, C
 Operator Theory in Hilbert Spaces, 2017, § 4 (firmly nonexpansive maps).
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply
-from lyapnet.base.types import OnBoxes
+from lyapnet.base.types import Control, ControlMatrix, OnBoxes
 from lyapnet.prover import taylor
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
@@ -77,6 +79,11 @@ class _Program(NamedTuple):
         """Whether W is diagonal on all boxes."""
         return not bool((self.W - torch.diag_embed(self.W.diagonal(dim1=-2, dim2=-1))).any())
 
+    @property
+    def forces(self) -> OnBoxes:
+        """A bound of |b| + |2Wu| + w, the slopes that balance at the minimum."""
+        return 2 * apply(self.W.abs(), self.size) + self.middle.abs() + self.reach + self.kinks
+
     def slope(self, u: OnBoxes, side: int) -> OnBoxes:
         """The slope of s on one side of u, −1 or 1, where each control costs by itself; ±∞ at a limit."""
         low, high = self.limits
@@ -111,7 +118,7 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
     costs, controls = known_as(named, b.radius.device)
     program = _Program(costs, controls, W, middle, reach, _sizes(controls, W, spread, middle.abs() + reach))
     u, value = least_over(costs, controls, W, middle)
-    forces = 2 * apply(W.abs(), program.size) + middle.abs() + reach + program.kinks
+    forces = program.forces
     found = _is_minimum(program, u, BACKWARD * forces)
     off = 2 * BACKWARD * forces + 2 * (1 + ROOM) * apply(spread, program.size)
     far, near = reach + off, FORWARD * program.size
@@ -123,12 +130,35 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
     curved, straight = taylor.multiply(y, Dy), y.with_parts(y.terms * u, y.radius * u.abs()).with_rounding()
     h = taylor.add(straight, curved.with_parts(curved.terms / 2, curved.radius / 2)).with_rounding(len(u[0]))
     error = far * apply(doubt, far) / 2 + program.size * apply(spread, program.size)
-    error = error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + 32 * EPSILON * program.size) * forces
+    error = (
+        error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + 32 * EPSILON * program.size) * forces
+    )
     terms, radius = h.terms.sum(-1, keepdim=True), (h.radius + error * (1 + ROOM)).sum(-1, keepdim=True)
     h = h.with_parts(torch.cat([terms[:1] + value[:, None], terms[1:]]), radius).with_rounding()
     terms, radius = torch.cat([law.terms, h.terms], -1), torch.cat([law.radius, h.radius], -1)
-    certain = known & definite & found & radius.isfinite().all(-1, keepdim=True) & terms.isfinite().all(0).all(-1, keepdim=True)
+    certain = (
+        known
+        & definite
+        & found
+        & radius.isfinite().all(-1, keepdim=True)
+        & terms.isfinite().all(0).all(-1, keepdim=True)
+    )
     return b.with_parts(torch.where(certain, terms, 0.0), torch.where(certain, radius, torch.inf))
+
+
+def is_minimum(
+    costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control, u: Control
+) -> Bool[Tensor, "*batch"]:
+    """Whether u is the minimiser, up to FORWARD and BACKWARD.
+
+    Args:
+        costs, controls: s and U; s is None for zero.
+        W: (batch, m, m) or (m, m).
+        b, u: (batch, m).
+    """
+    W = W.expand(*b.shape, b.shape[-1])
+    program = _Program(costs, controls, W, b, torch.zeros_like(b), _sizes(controls, W, torch.zeros_like(W), b.abs()))
+    return _is_minimum(program, u, BACKWARD * program.forces)[..., 0]
 
 
 def _matrices(W: Any, like: TaylorForm) -> tuple[OnBoxes, OnBoxes, Tensor]:
@@ -286,8 +316,8 @@ def _slopes_of_radius(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxe
     crosses = (n[0] <= 0) & (n[1] >= 0)
     nn = torch.where(square & ~crosses[..., None], nn[0], torch.where(square, 0.0, nn[0])), nn[1]
     gap = turn[0] - grow[1], turn[1] - grow[0]
-    gap = tuple(torch.where(active & (w == 0), 0.0, side)[:, None, None] for side in gap)
-    low, high = _products(gap, nn)
+    equal = active & (w == 0)  # then a/β = a'
+    low, high = _products(tuple(torch.where(equal, 0.0, side)[:, None, None] for side in gap), nn)
     one = square.to(b_low)
     return low - turn[1][:, None, None] * one, high - turn[0][:, None, None] * one
 
@@ -297,7 +327,7 @@ def _direction(b: OnBoxes, others: OnBoxes) -> OnBoxes:
     return b / (b * b + others).sqrt().clamp_min(TINY)
 
 
-def _products(x: tuple[Tensor, Tensor], y: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _products(x: Sequence[Tensor], y: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """The range of products of two intervals."""
     ends = torch.stack([a * b for a in x for b in y])
     return ends.amin(0), ends.amax(0)

@@ -85,7 +85,6 @@ class HJBPolicy(ValuePolicy):
         u = -0.5 * self.cost.solve_R(x, b)  # a constant R is inverted only once
         return u if rest is None else u + rest
 
-
     def least(self, t: Time, x: State) -> LeastCost | None:
         if type(self).forward is not HJBPolicy.forward or type(self)._minimise is not HJBPolicy._minimise:
             return None

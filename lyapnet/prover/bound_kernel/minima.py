@@ -3,6 +3,7 @@
 Others, with smooth costs of controls or with ‖u‖, are bounded by the interpreter.
 """
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -21,9 +22,13 @@ OF_U, OF_H = 1e-8, 2e-9  # of (|b| + w)/r; and of (b² + w²)/r
 
 def _least(program: Program, W: Any, b: Forms, named: str) -> Forms:
     """(u, h), where W is diagonal and does not depend on the point."""
-    if isinstance(W, Forms) or bool((W != torch.diag_embed(W.diagonal())).any()):
+    if isinstance(W, Forms) or bool((torch.diag_embed(W.diagonal()) != W).any()):
         raise NotImplementedError("W depends on the point, or is not diagonal")
-    known, bend, numbers = known_as(named, torch.device("cpu")), 2 * W.diagonal(), [Entry(k) for k in b.entries.tolist()]
+    known, bend, numbers = (
+        known_as(named, torch.device("cpu")),
+        2 * W.diagonal(),
+        [Entry(k) for k in b.entries.tolist()],
+    )
     in_ball = isinstance(known.controls, ControlBall) and len(numbers) > 1
     u, h = (_in_ball if in_ball else _between_limits)(program, known, bend, numbers)
     return Forms(torch.tensor([*u, h], dtype=torch.int64))
@@ -48,11 +53,12 @@ def _in_ball(program: Program, known: Known, bend: Tensor, b: list[Entry]) -> tu
 def _between_limits(program: Program, known: Known, bend: Tensor, b: list[Entry]) -> tuple[list[Entry], Entry]:
     """u(b) = u(β₀) + s₀(b − β₀) + Σ Δsₖ max(b − βₖ, 0) for each control, and h, the integral of it."""
     parts = [] if known.costs is None else [*known.costs.costs]
-    if not all(isinstance(part, AbsoluteCost) for part in parts):
+    absolute = [part for part in parts if isinstance(part, AbsoluteCost)]
+    if len(absolute) < len(parts):
         raise NotImplementedError("smooth costs, or ‖u‖")
     assert known.controls.limits is not None
     m, controls, values = len(b), list[Entry](), list[tuple[float, Entry]]()
-    w = sum((part.weight for part in parts), torch.zeros(m, dtype=torch.float64)).tolist()
+    w = sum((part.weight for part in absolute), torch.zeros(m, dtype=torch.float64)).tolist()
     low, high = (side.double().expand(m).tolist() for side in known.controls.limits)
     for x, *numbers in zip(b, bend.tolist(), w, low, high, strict=True):
         line = _Line.of(*numbers)
@@ -95,7 +101,7 @@ class _Line(NamedTuple):
         kinks = [-w, w] if low < 0 < high else []
         ends = [-(r * high + math.copysign(w, high or -1)), -(r * low + math.copysign(w, low or 1))]
         bends = sorted({0.0 + each for each in (*kinks, *ends) if math.isfinite(each)}) or [0.0]
-        inner = [-1 / r if u(left) != u(right) else 0.0 for left, right in zip(bends, bends[1:], strict=False)]
+        inner = [-1 / r if u(left) != u(right) else 0.0 for left, right in itertools.pairwise(bends)]
         outer = [-1 / r if math.isinf(side) else 0.0 for side in (high, low)]
         at = u(bends[0])
         value = (r / 2 * at + bends[0]) * at + w * abs(at)

@@ -25,7 +25,15 @@ FUNCTIONS = {
         "leaky", "clamp", "within_ball", "slope_within_ball",
     ))
 }  # fmt: skip
-LINEAR = {"tan", "square", "absolute", "leaky", "clamp", "within_ball", "slope_within_ball"}  # functions that are bounded by a line for any degree
+LINEAR = {
+    "tan",
+    "square",
+    "absolute",
+    "leaky",
+    "clamp",
+    "within_ball",
+    "slope_within_ball",
+}  # functions that are bounded by a line for any degree
 
 Support = tuple[int, ...]  # increasing numbers of the monomials that a form can have, 0 (the constant) included
 CONSTANT: Support = (0,)

@@ -1,4 +1,4 @@
-"""min over u ∈ U of uᵀWu + bᵀu + s(u) and where it is, as one operator of traces whose bounds know that it is a minimum."""
+"""min over u ∈ U of uᵀWu + bᵀu + s(u), and where it is: one operator of traces, so that bounds know it as a minimum."""
 
 import copy
 from collections.abc import Iterator
@@ -48,7 +48,9 @@ class Known(NamedTuple):
 
     def to(self, device: torch.device) -> "Known":
         """A copy on a device."""
-        return Known(*(None if part is None else copy.deepcopy(part).double().to(device) for part in self))
+        costs, controls = (None if part is None else copy.deepcopy(part).double().to(device) for part in self)
+        assert isinstance(controls, ControlSet)
+        return Known(costs if isinstance(costs, ControlCosts) else None, controls)
 
 
 def description(costs: ControlCosts | None, controls: ControlSet) -> str | None:
@@ -68,9 +70,7 @@ def _numbers(part: nn.Module) -> Iterator[str]:
             yield f"{name}={getattr(part, name)!r}"
 
 
-def traced_minimum(
-    costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control
-) -> Minimum | None:
+def traced_minimum(costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum | None:
     """The minimum by the operator; None unless a trace with this operator is being made, and it knows s and U."""
     if not are_operators(MINIMA) or is_quadratic_between_limits(costs, controls) or is_transformed(b):
         return None

@@ -157,8 +157,10 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
         UsageError: at a point u is farther from it than bounds allow for.
     """
     policy, points = loop.policy, _random_points(domain)
+    if not isinstance(policy, ValuePolicy):
+        return ""
     with torch.no_grad():
-        least = policy.least(points[:, 0], points[:, 1:]) if isinstance(policy, ValuePolicy) else None
+        least = policy.least(points[:, 0], points[:, 1:])
         if least is None:
             return ""
         R = policy.cost.R(points[:, 1:])

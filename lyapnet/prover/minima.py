@@ -262,7 +262,7 @@ def _slopes_of_each(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]
     still, may_be = torch.zeros_like(bend, dtype=torch.bool), torch.zeros_like(bend, dtype=torch.bool)
     w = program.kinks
     for start, end in ((-w, w), *_at_limits(program, bend)):  # intervals of b on which u is constant
-        room = ROOM * torch.maximum(start.abs(), end.abs()).nan_to_num(0, 0, 0)
+        room = ROOM * torch.maximum(start.abs().nan_to_num(0, 0, 0), end.abs().nan_to_num(0, 0, 0))
         still = still | ((b_low >= start + room) & (b_high <= end - room) & (end > start))
         may_be = may_be | ((b_low <= end + room) & (b_high >= start - room) & (end > start))
     return torch.where(still, 0.0, steep), torch.where(may_be, 0.0, mild)

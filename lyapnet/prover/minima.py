@@ -25,11 +25,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply
-from lyapnet.base.types import Control, ControlMatrix, OnBoxes
 from lyapnet.prover import taylor
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
@@ -37,6 +36,8 @@ from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts, Separabl
 from lyapnet.task.cost.minimum import LEAST, known_as, least_over
 from lyapnet.task.sets import ControlSet, Unbounded
 
+Vectors = Float[Tensor, "boxes m"]
+Matrices = Float[Tensor, "boxes m m"]
 FORWARD, BACKWARD = 1e-10, 1e-9  # see above; float64 has 1e-16, which R of a condition of 1e5 makes 1e-11
 ROOM = 1e-9  # of a slope, for the rounding of its bounds
 
@@ -46,10 +47,10 @@ class _Program(NamedTuple):
 
     costs: ControlCosts | None  # s
     controls: ControlSet  # U
-    W: OnBoxes  # (boxes, m, m)
-    middle: OnBoxes  # (boxes, m)
-    reach: OnBoxes  # (boxes, m)
-    size: OnBoxes  # a bound of |uᵢ|, (boxes, m)
+    W: Matrices
+    middle: Vectors
+    reach: Vectors
+    size: Vectors  # a bound of |uᵢ|
 
     @property
     def radial(self) -> bool:
@@ -80,11 +81,11 @@ class _Program(NamedTuple):
         return not bool((self.W - torch.diag_embed(self.W.diagonal(dim1=-2, dim2=-1))).any())
 
     @property
-    def forces(self) -> OnBoxes:
+    def forces(self) -> Vectors:
         """A bound of |b| + |2Wu| + w, the slopes that balance at the minimum."""
         return 2 * apply(self.W.abs(), self.size) + self.middle.abs() + self.reach + self.kinks
 
-    def slope(self, u: OnBoxes, side: int) -> OnBoxes:
+    def slope(self, u: Vectors, side: int) -> Vectors:
         """The slope of s on one side of u, −1 or 1, where each control costs by itself; ±∞ at a limit."""
         low, high = self.limits
         total = self.kinks * torch.where(side * u >= 0, side, -side)
@@ -93,7 +94,7 @@ class _Program(NamedTuple):
         return torch.where(u >= high, torch.inf, total) if side > 0 else torch.where(u <= low, -torch.inf, total)
 
 
-def _inside(cost: SeparableCost, name: str, u: OnBoxes, beyond: Any) -> OnBoxes:
+def _inside(cost: SeparableCost, name: str, u: Vectors, beyond: Any) -> Vectors:
     """A method of a cost; another value from its open limit on, if there is one."""
     end = cost.open_limit
     if end is None:
@@ -147,21 +148,19 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
 
 
 def is_minimum(
-    costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control, u: Control
-) -> Bool[Tensor, "*batch"]:
+    costs: ControlCosts | None, controls: ControlSet, W: Matrices, b: Vectors, u: Vectors
+) -> Bool[Tensor, " boxes"]:
     """Whether u is the minimiser, up to FORWARD and BACKWARD.
 
     Args:
         costs, controls: s and U; s is None for zero.
-        W: (batch, m, m) or (m, m).
-        b, u: (batch, m).
+        W, b, u: of a batch with one axis.
     """
-    W = W.expand(*b.shape, b.shape[-1])
     program = _Program(costs, controls, W, b, torch.zeros_like(b), _sizes(controls, W, torch.zeros_like(W), b.abs()))
     return _is_minimum(program, u, BACKWARD * program.forces)[..., 0]
 
 
-def _matrices(W: Any, like: TaylorForm) -> tuple[OnBoxes, OnBoxes, Tensor]:
+def _matrices(W: Any, like: TaylorForm) -> tuple[Matrices, Matrices, Tensor]:
     """(W₀, a bound of |W − W₀|, whether W is positive definite on the box (boxes, 1)); where it is not, W₀ is 1."""
     boxes, m = like.radius.shape
     if isinstance(W, TaylorForm):
@@ -177,13 +176,13 @@ def _matrices(W: Any, like: TaylorForm) -> tuple[OnBoxes, OnBoxes, Tensor]:
     return torch.where(definite, middle, one), torch.where(definite, spread, 0.0), definite[..., 0]
 
 
-def _stiffness(W: OnBoxes, spread: OnBoxes) -> OnBoxes:
+def _stiffness(W: Matrices, spread: Matrices) -> Float[Tensor, "boxes 1"]:
     """A lower bound of the least eigenvalue of W, (boxes, 1)."""
     size = torch.linalg.matrix_norm(W)
     return (torch.linalg.eigvalsh(W)[..., 0] - 1e-12 * size - torch.linalg.matrix_norm(spread) * (1 + ROOM))[:, None]
 
 
-def _sizes(controls: ControlSet, W: OnBoxes, spread: OnBoxes, b: OnBoxes) -> OnBoxes:
+def _sizes(controls: ControlSet, W: Matrices, spread: Matrices, b: Vectors) -> Vectors:
     """A bound of |uᵢ|: its limits; and ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W, if U contains 0."""
     free = b.norm(dim=-1, keepdim=True) * (1 + ROOM) / (2 * _stiffness(W, spread))
     if controls.limits is None:
@@ -194,13 +193,13 @@ def _sizes(controls: ControlSet, W: OnBoxes, spread: OnBoxes, b: OnBoxes) -> OnB
     return torch.minimum(free, torch.maximum(low.abs(), high.abs())).expand_as(b)
 
 
-def _linear(D: OnBoxes, y: TaylorForm) -> TaylorForm:
+def _linear(D: Matrices, y: TaylorForm) -> TaylorForm:
     """Dy with a matrix D for each box."""
     y = y.with_rounding(2 * D.shape[-1])  # as in taylor.matrix_product
     return y.with_parts(apply(D, y.terms), apply(D.abs(), y.radius) + TINY)
 
 
-def _is_minimum(program: _Program, u: OnBoxes, tolerance: OnBoxes) -> Tensor:
+def _is_minimum(program: _Program, u: Vectors, tolerance: Vectors) -> Tensor:
     """Whether u is the minimiser for b in the middle, up to FORWARD and BACKWARD, (boxes, 1)."""
     near, slope = FORWARD * program.size, 2 * apply(program.W, u) + program.middle
     if not program.radial:
@@ -219,7 +218,7 @@ def _is_minimum(program: _Program, u: OnBoxes, tolerance: OnBoxes) -> Tensor:
     return torch.where(still, program.middle.norm(dim=-1, keepdim=True) <= w + most, moving)
 
 
-def _slopes(program: _Program) -> tuple[OnBoxes, OnBoxes]:
+def _slopes(program: _Program) -> tuple[Matrices, Matrices]:
     """(D, a bound of |u_b − D|) on the box, (boxes, m, m) each."""
     W, diagonal = program.W, program.W.diagonal(dim1=-2, dim2=-1)
     if program.is_diagonal:
@@ -241,7 +240,7 @@ def _slopes(program: _Program) -> tuple[OnBoxes, OnBoxes]:
     return (low + high) / 2, (high - low) / 2 + room
 
 
-def _slopes_of_each(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]:
+def _slopes_of_each(program: _Program, bend: Vectors) -> tuple[Vectors, Vectors]:
     """The range of ∂uᵢ/∂bᵢ = −1/(rᵢ + σᵢ''(uᵢ)) for a diagonal W, (boxes, m) each.
 
     Args:
@@ -268,11 +267,11 @@ def _slopes_of_each(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]
     return torch.where(still, 0.0, steep), torch.where(may_be, 0.0, mild)
 
 
-def _at_limits(program: _Program, bend: OnBoxes) -> list[tuple[OnBoxes, OnBoxes]]:
+def _at_limits(program: _Program, bend: Vectors) -> list[tuple[Vectors, Vectors]]:
     """The intervals of b, (boxes, m) each, on which u is at its upper and at its lower limit."""
     low, high = program.limits
     free = program._replace(controls=Unbounded())
-    ends = list[tuple[OnBoxes, OnBoxes]]()
+    ends = list[tuple[Vectors, Vectors]]()
     everywhere = torch.full_like(bend, torch.inf)
     upper, lower = high.expand_as(bend), low.expand_as(bend)
     at_upper = torch.where(upper.isfinite(), -(bend * upper + free.slope(upper, -1)), -torch.inf)
@@ -282,7 +281,7 @@ def _at_limits(program: _Program, bend: OnBoxes) -> list[tuple[OnBoxes, OnBoxes]
     return ends
 
 
-def _slopes_of_radius(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxes]:
+def _slopes_of_radius(program: _Program, bend: Float[Tensor, " boxes"]) -> tuple[Matrices, Matrices]:
     """The range of u_b for u = −b a(β)/β, β = ‖b‖, a = min(max(β − w, 0)/r, radius), (boxes, m, m) each:
 
         u_b = −a/β + (a/β − a') n nᵀ,     n = b/β.
@@ -322,7 +321,7 @@ def _slopes_of_radius(program: _Program, bend: OnBoxes) -> tuple[OnBoxes, OnBoxe
     return low - turn[1][:, None, None] * one, high - turn[0][:, None, None] * one
 
 
-def _direction(b: OnBoxes, others: OnBoxes) -> OnBoxes:
+def _direction(b: Vectors, others: Vectors) -> Vectors:
     """bᵢ/√(bᵢ² + others), and ±1 without others."""
     return b / (b * b + others).sqrt().clamp_min(TINY)
 

@@ -15,6 +15,9 @@ from lyapnet.prover.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.branches import decisions
 from lyapnet.prover.rounding import ROUNDED
+from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts
+from lyapnet.task.cost.minimum import LEAST, make_known
+from lyapnet.task.sets import ControlBox
 from tests.marks import sample
 
 aten = torch.ops.aten
@@ -22,8 +25,19 @@ AXES = 3
 WIDTHS = (2.0, 0.5, 0.1, 1e-2, 1e-3, 1e-5)
 INDEX, TWICE = torch.tensor([2, 0]), torch.tensor([2, 2])
 
+COST, LIMITS = ControlCosts([AbsoluteCost(0.3)]), ControlBox(-0.4, 0.2)
+FUEL = make_known(COST, LIMITS)
+
+
+def least_fuel(b):
+    """argmin and min of Σ u² + bu + 0.3|u| for −0.4 ≤ u ≤ 0.2."""
+    u = (torch.nn.functional.softshrink(b, 0.3) / -2).clamp(-0.4, 0.2)
+    return torch.cat([u, (u * u + b * u + 0.3 * u.abs()).sum()[None]])
+
+
 CASES = {
     ROUNDED: lambda y, z, M, N: ROUNDED(y, z, 1e-9, 1e-9, 1e9),
+    LEAST: lambda y, z, M, N: LEAST(EYE, y, FUEL),
     aten.relu.default: lambda y, z, M, N: aten.relu(y),
     aten.leaky_relu.default: lambda y, z, M, N: aten.leaky_relu(y, 0.3),
     aten.abs.default: lambda y, z, M, N: aten.abs(y),
@@ -143,6 +157,7 @@ WRITTEN_OUT = {
     aten.fill.Scalar: lambda y, z, M, N: 0.3 * z + y,
     aten.empty_like.default: lambda y, z, M, N: 0.3 * z,
     ROUNDED: lambda y, z, M, N: y,
+    LEAST: lambda y, z, M, N: least_fuel(y),
     aten.silu_backward.default: lambda y, z, M, N: z * torch.sigmoid(4 * y) * (1 + 4 * y * torch.sigmoid(-4 * y)),
 }
 """The same, for operators that torch does not batch or differentiate."""

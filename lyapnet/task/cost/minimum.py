@@ -75,12 +75,10 @@ def traced_minimum(costs: ControlCosts | None, controls: ControlSet, W: ControlM
     if not are_operators(MINIMA) or is_quadratic_between_limits(costs, controls) or is_transformed(b):
         return None
     with torch._C.DisableTorchFunction(), _disable_current_modes():  # numbers, not operations of the trace
-        named = description(costs, controls)
-        if named is None:
-            return None
-        if named not in _known:
-            _known[named] = {_CPU: Known(costs, controls).to(_CPU)}
-    both = torch.ops.lyapnet.least(W, b, named)
+        named = make_known(costs, controls)
+    if named is None:
+        return None
+    both = LEAST(W, b, named)
     return Minimum(both[..., :-1], both[..., -1])
 
 
@@ -88,8 +86,16 @@ _CPU = torch.device("cpu")
 _known = dict[str, dict[torch.device, Known]]()
 
 
+def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
+    """The description of s and U, by which the operator finds them in this process; None if it has none."""
+    named = description(costs, controls)
+    if named is not None and named not in _known:
+        _known[named] = {_CPU: Known(costs, controls).to(_CPU)}
+    return named
+
+
 def known_as(named: str, device: torch.device) -> Known:
-    """s and U with a description that `traced_minimum` has seen in this process."""
+    """s and U with a description that `make_known` has given in this process."""
     copies = _known[named]
     if device not in copies:
         copies[device] = copies[_CPU].to(device)

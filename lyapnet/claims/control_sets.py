@@ -27,6 +27,7 @@ from lyapnet.task.cost.minimum import description, is_quadratic_between_limits
 from lyapnet.value.policy import HJBPolicy, SampledPolicy, ValuePolicy
 
 POINTS, DESCENTS = 20_000, 20  # where u ∈ U is not proved: points to test, and descent steps from the worst of them
+MINIMA = 5000  # points at which u is tested as a minimum
 ROUNDING = 1e-6  # of the largest |u|: how far u may lie outside of U
 BOXES, SECONDS = 2000, 20.0  # limits of the proof
 ASSUMED = "That u stays in U was tested at {} points of [0, T] × D, and is not proved: bounds cannot decide it for {}."
@@ -54,7 +55,7 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     if not isinstance(policy, ValuePolicy) or not policy.controls.limited or not reaches_own_code(policy.controls):
         return ""
     name, (lower, upper) = type(policy.controls).__name__, domain
-    points = _random_points(domain)
+    points = _random_points(domain, POINTS)
     with torch.no_grad():
         u = policy(points[:, 0], points[:, 1:])
         room = ROUNDING * float(u.abs().max())
@@ -90,8 +91,6 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
 def require_written_law(loop: ClosedLoop, claim: str) -> None:
     """Refuse a law that minimises another cost than uᵀRu, or in a ball, for a claim whose bounds read u as written.
 
-    A single control that pays |u| is a closed form.
-
     Args:
         claim: the kind of the certificate, for the message.
 
@@ -99,14 +98,19 @@ def require_written_law(loop: ClosedLoop, claim: str) -> None:
         UsageError: the message names the costs and the set.
     """
     policy = loop.policy
-    if not isinstance(policy, ValuePolicy) or is_quadratic_between_limits(policy.cost.nonquadratic, policy.controls):
-        return
-    if policy.system.m == 1 and _pays_absolute_values(policy) and not isinstance(policy.controls, ControlBall):
+    if not isinstance(policy, ValuePolicy) or reads_as_written(policy):
         return
     raise UsageError(
         f"Expected controls that cost uᵀRu, without limits or between them, for a {claim} certificate, got "
         f"{_in_words(policy)}; a sound certificate takes it, and a statistical one."
     )
+
+
+def reads_as_written(policy: ValuePolicy) -> bool:
+    """Whether u is written in a closed form: of uᵀRu between limits, or of a single control that pays |u|."""
+    if is_quadratic_between_limits(policy.cost.nonquadratic, policy.controls):
+        return True
+    return policy.system.m == 1 and _pays_absolute_values(policy) and not isinstance(policy.controls, ControlBall)
 
 
 def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
@@ -156,7 +160,7 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     Raises:
         UsageError: at a point u is farther from it than bounds allow for.
     """
-    policy, points = loop.policy, _random_points(domain)
+    policy, points = loop.policy, _random_points(domain, MINIMA)
     if not isinstance(policy, ValuePolicy):
         return ""
     with torch.no_grad():
@@ -171,12 +175,12 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
             f"Expected u that minimises ℓ + V_xᵀ(f + gu) up to {BACKWARD:g}, got u = {least.u[k].tolist()} at (t, x) = "
             f"{points[k].tolist()}, where Newton's method has not converged; give controls a larger R."
         )
-    return MINIMISED.format(BACKWARD, POINTS)
+    return MINIMISED.format(BACKWARD, MINIMA)
 
 
-def _random_points(domain: tuple[Corner, Corner]) -> Tensor:
+def _random_points(domain: tuple[Corner, Corner], count: int) -> Tensor:
     lower, upper = domain
-    share = torch.rand(POINTS, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
+    share = torch.rand(count, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
     return lower + (upper - lower) * share
 
 

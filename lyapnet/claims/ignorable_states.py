@@ -2,11 +2,13 @@
 
 import torch
 
+from lyapnet.claims.control_sets import reads_as_written
 from lyapnet.graphs.tracing import trace
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.branches import JUMPS
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.cost import innermost, is_quadratic
+from lyapnet.value.policy import ValuePolicy
 
 
 def ignorable_states(closed_loop: ClosedLoop, constraints: Constraints | None = None) -> list[int]:
@@ -34,7 +36,13 @@ def _depends_on(closed_loop: ClosedLoop, i: int) -> bool:
 
 
 def has_jumps(closed_loop: ClosedLoop) -> bool:
-    """Whether f, g, ℓ, φ, V or u may jump: one of their operators jumps or compares, or they cannot be traced."""
+    """Whether f, g, ℓ, φ, V or u may jump: one of their operators jumps or compares, or they cannot be traced.
+
+    Newton's method for u compares, which need not be traced to be known.
+    """
+    policy = closed_loop.policy
+    if isinstance(policy, ValuePolicy) and not reads_as_written(policy):
+        return True
     try:
         graph = trace(lambda t, x: _all_parts(closed_loop, t, x), _generic_point(closed_loop)).graph
     except Exception:  # user code may raise anything; the proof refuses it later, with the reason

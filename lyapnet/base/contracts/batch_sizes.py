@@ -25,6 +25,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
 
 from lyapnet.base.errors import UsageError, is_own_file, one_line, own_line, place_of, running_line
+from lyapnet.base.operators import MINIMA, as_operators
 
 HINT = 67  # batch size that torch uses internally, different from all other sizes
 TEST_STATES = 101  # states of the batch on which each operator is tested
@@ -156,7 +157,7 @@ def _traced(function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Ten
         lambda *each: function(*each),
         tracing_mode="fake", _allow_non_fake_inputs=True, _disable_torch_fn_metadata_mode=True,
     )  # fmt: skip
-    with torch.no_grad(), _Lines(sizes), _without_log():
+    with torch.no_grad(), _Lines(sizes), _without_log(), as_operators(MINIMA):
         graph_module = traced(*batches)
     graph_module.graph.eliminate_dead_code()
     return graph_module

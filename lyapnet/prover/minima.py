@@ -21,7 +21,7 @@ Sources: Rockafellar, Convex Analysis, 1970, § 23, 26 (conjugates); Bauschke, C
 Operator Theory in Hilbert Spaces, 2017, § 4 (firmly nonexpansive maps).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -30,10 +30,13 @@ from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply
 from lyapnet.prover import taylor
+from lyapnet.prover.branches import relu
+from lyapnet.prover.closed_minima import closed_minimum
+from lyapnet.prover.elementary_functions import Elementary, square
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts, SeparableCost
-from lyapnet.task.cost.minimum import LEAST, known_as, least_over
+from lyapnet.task.cost.minimum import LEAST, Known, known_as, least_over
 from lyapnet.task.sets import ControlSet, Unbounded
 
 Vectors = Float[Tensor, "boxes m"]
@@ -111,12 +114,21 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
         b: (m,), a form or constant.
     """
     b = b if isinstance(b, TaylorForm) else taylor.constant_form(b, W)
+    costs, controls = known_as(named, b.radius.device)
+    if isinstance(W, Tensor):
+        try:
+            u, h = closed_minimum(_ByForms(), Known(costs, controls), W, _numbers(b))
+        except NotImplementedError:
+            pass
+        else:
+            return b.with_parts(
+                torch.stack([x.terms for x in (*u, h)], -1), torch.stack([x.radius for x in (*u, h)], -1)
+            )
     low, high = b.interval()
     known = (low.isfinite() & high.isfinite()).all(-1, keepdim=True)
     middle = torch.where(known, b.center, 0.0)
     reach = torch.where(known, torch.maximum(high - middle, middle - low), 1.0)
     W, spread, definite = _matrices(W, b)
-    costs, controls = known_as(named, b.radius.device)
     program = _Program(costs, controls, W, middle, reach, _sizes(controls, W, spread, middle.abs() + reach))
     u, value = least_over(costs, controls, W, middle)
     forces = program.forces
@@ -145,6 +157,58 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
         & terms.isfinite().all(0).all(-1, keepdim=True)
     )
     return b.with_parts(torch.where(certain, terms, 0.0), torch.where(certain, radius, torch.inf))
+
+
+def _numbers(b: TaylorForm) -> list[TaylorForm]:
+    return [b.with_parts(terms, radius) for terms, radius in zip(b.terms.unbind(-1), b.radius.unbind(-1), strict=True)]
+
+
+class _ByForms:
+    """The operations of closed forms, on Taylor forms of single numbers."""
+
+    def combine(
+        self, summands: Iterable[tuple[float, TaylorForm]], offset: float = 0.0, operations: int = 1
+    ) -> TaylorForm:
+        pairs = list(summands)
+        terms = torch.stack([weight * x.terms for weight, x in pairs]).sum(0)
+        radius = torch.stack([abs(weight) * x.radius for weight, x in pairs]).sum(0)
+        moved = torch.cat([(terms[0] + offset)[None], terms[1:]])
+        return pairs[0][1].with_parts(moved, radius).with_rounding(operations + len(pairs))
+
+    def multiply(self, x: TaylorForm, y: TaylorForm) -> TaylorForm:
+        return taylor.multiply(x, y)
+
+    def square(self, x: TaylorForm) -> TaylorForm:
+        return square(x)
+
+    def function(self, name: str, x: TaylorForm) -> TaylorForm:
+        return FUNCTIONS[name](x)
+
+    def rounded(self, x: TaylorForm, *limits: float) -> TaylorForm:
+        relative, absolute, _ = limits
+        room = (relative * x.magnitude * (1 + ROOM) + absolute) * (1 + ROOM)
+        return x.with_parts(x.terms, x.radius + room).with_rounding()
+
+
+def _within_ball(v: Tensor) -> Tensor:
+    """v up to 1, and 2√v − 1 beyond."""
+    return torch.where(v > 1, 2 * v.clamp_min(1).sqrt() - 1, v)
+
+
+def _slope_within_ball(v: Tensor) -> Tensor:
+    return v.clamp_min(1).rsqrt()
+
+
+FUNCTIONS = {
+    "leaky": relu,
+    "within_ball": Elementary(_within_ball, _slope_within_ball, lambda a, lo, hi: [1 / (a * a)]),
+    "slope_within_ball": Elementary(
+        _slope_within_ball,
+        lambda v: torch.where(v > 1, -0.5 * v.clamp_min(1) ** -1.5, 0.0),
+        lambda a, lo, hi: [torch.ones_like(a), (4 * a * a) ** (-1 / 3)],
+    ),
+}
+"""The functions of closed forms, by their names in machine code."""
 
 
 def is_minimum(

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from lyapnet.base.linear_algebra import apply
 from lyapnet.prover import minima
@@ -21,7 +22,7 @@ from lyapnet.task.cost.minimum import least_over, make_known, traced_minimum
 from lyapnet.task.sets import ControlBox, Unbounded
 from tests.marks import at_the_gate, sample
 
-AXES = 3
+AXES, CORNER = 3, torch.full((3,), 2.0, dtype=torch.float64)
 WEIGHTS = [0.5, 1.0, 1.5, 0.8, 0.4, 1.2]
 
 
@@ -149,9 +150,32 @@ def test_machine_code_leaves_others_to_the_interpreter():
 @pytest.mark.parametrize("name", ["absolute, limits", "power 1.5, no limits", "entropy, limits", "norm, ball", "ball"])
 def test_bounds_that_are_too_narrow_are_found(name, monkeypatch):
     """The twin: without the doubt about slopes."""
-    slopes = minima._slopes
+    slopes, kind = minima._slopes, "full" if name in ("absolute, limits", "ball") else "multiple of the identity"
     monkeypatch.setattr(minima, "_slopes", lambda program: (slopes(program)[0], 0 * slopes(program)[1]))
+    assert examine(*pairs(2)[name], 2, kind, 2, 200, 20)[1] > 0
+
+
+@pytest.mark.parametrize(("name", "function"), [("absolute, limits", "leaky"), ("ball", "slope_within_ball")])
+def test_closed_forms_that_are_too_narrow_are_found(name, function, monkeypatch):
+    exact = minima.FUNCTIONS[function]
+    monkeypatch.setitem(minima.FUNCTIONS, function, lambda x: exact(x).with_parts(exact(x).terms, 0 * x.radius))
     assert examine(*pairs(2)[name], 2, "multiple of the identity", 2, 200, 20)[1] > 0
+
+
+@pytest.mark.parametrize("name", ["absolute, limits", "ball"])
+def test_machine_code_and_the_interpreter_agree(name):
+    """Otherwise a leaf that one of them closed might stay undecided when its proof is checked."""
+    s, U = pairs(2)[name]
+    bounded = BoundedFunction(
+        lambda t, x: tuple(traced_minimum(s, U, 0.4 * torch.eye(2), x + 0 * t)), (-CORNER, CORNER)
+    )
+    middle, half = 4 * torch.rand(200, 3) - 2, torch.rand(200, 3)
+    box = middle - half, middle + half
+    kernel = bounded.kernel(*box)
+    assert kernel is not None
+    for one, other in zip(kernel.forms(*box), bounded.image(box_form(*box, 2)), strict=True):
+        for a, b in zip(one.interval(), other.interval(), strict=True):
+            assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", pairs(2))

@@ -1,111 +1,21 @@
-"""The rule of lyapnet.prover.minima for machine code, for u that is piecewise linear in b, and for a ball.
+"""The rule of lyapnet.prover.minima for machine code, which has closed forms alone; the interpreter has the others."""
 
-Others, with smooth costs of controls or with ‖u‖, are bounded by the interpreter.
-"""
-
-import itertools
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from lyapnet.prover.bound_kernel.program import Entry, Forms, Program
 from lyapnet.prover.bound_kernel.rules import Rule
-from lyapnet.task.ball import ControlBall
-from lyapnet.task.cost.control_costs import AbsoluteCost
-from lyapnet.task.cost.minimum import LEAST, Known, known_as
-
-# how exact u and h of the law are: more than FORWARD and BACKWARD of lyapnet.prover.minima add up to
-OF_U, OF_H = 1e-8, 2e-9  # of (|b| + w)/r; and of (b² + w²)/r
+from lyapnet.prover.closed_minima import closed_minimum
+from lyapnet.task.cost.minimum import LEAST, known_as
 
 
-def _least(program: Program, W: Any, b: Forms, named: str) -> Forms:
-    """(u, h), where W is diagonal and does not depend on the point."""
-    if isinstance(W, Forms) or bool((torch.diag_embed(W.diagonal()) != W).any()):
-        raise NotImplementedError("W depends on the point, or is not diagonal")
-    known, bend, numbers = (
-        known_as(named, torch.device("cpu")),
-        2 * W.diagonal(),
-        [Entry(k) for k in b.entries.tolist()],
-    )
-    in_ball = isinstance(known.controls, ControlBall) and len(numbers) > 1
-    u, h = (_in_ball if in_ball else _between_limits)(program, known, bend, numbers)
+def _least(program: Program, W: Any, b: Any, named: str) -> Forms:
+    """(u, h)."""
+    if isinstance(W, Forms) or not isinstance(b, Forms):
+        raise NotImplementedError("W depends on the point, or b does not")
+    u, h = closed_minimum(program, known_as(named, torch.device("cpu")), W, [Entry(k) for k in b.entries.tolist()])
     return Forms(torch.tensor([*u, h], dtype=torch.int64))
-
-
-def _in_ball(program: Program, known: Known, bend: Tensor, b: list[Entry]) -> tuple[list[Entry], Entry]:
-    """u = −b/r H'(z) and h = −s/(2r) H(z) with z = ‖b‖²/s, s = (r radius)², H(z) = z, or 2√z − 1 from z = 1 on."""
-    if known.costs is not None or bool((bend != bend[0]).any()):
-        raise NotImplementedError("costs beside uᵀWu, or a W that is no multiple of the identity")
-    assert known.controls.limits is not None
-    r, radius, m = float(bend[0]), float(known.controls.limits[1]), len(b)
-    s = (r * radius) ** 2
-    squared = program.combine([(1, program.square(x)) for x in b], operations=m)
-    z = program.combine([(1 / s, squared)], operations=4)
-    beyond = program.function("slope_within_ball", z)
-    off = [(1 / r, _error(program, x, OF_U)) for x in b]
-    u = [program.combine([(-1 / r, program.multiply(x, beyond)), *off], operations=m + 2) for x in b]
-    least = (-s / (2 * r), program.function("within_ball", z))
-    return u, program.combine([least, (1 / r, _error(program, squared, OF_H))], operations=4)
-
-
-def _between_limits(program: Program, known: Known, bend: Tensor, b: list[Entry]) -> tuple[list[Entry], Entry]:
-    """u(b) = u(β₀) + s₀(b − β₀) + Σ Δsₖ max(b − βₖ, 0) for each control, and h, the integral of it."""
-    parts = [] if known.costs is None else [*known.costs.costs]
-    absolute = [part for part in parts if isinstance(part, AbsoluteCost)]
-    if len(absolute) < len(parts):
-        raise NotImplementedError("smooth costs, or ‖u‖")
-    assert known.controls.limits is not None
-    m, controls, values = len(b), list[Entry](), list[tuple[float, Entry]]()
-    w = sum((part.weight for part in absolute), torch.zeros(m, dtype=torch.float64)).tolist()
-    low, high = (side.double().expand(m).tolist() for side in known.controls.limits)
-    for x, *numbers in zip(b, bend.tolist(), w, low, high, strict=True):
-        line = _Line.of(*numbers)
-        r, kink, first = line.r, line.w, line.bends[0]
-        y = program.combine([(1, x)], -first)
-        u, h = [(line.slopes[0], y)], [(line.u, y), (line.slopes[0] / 2, program.square(y))]
-        for k, bend_at in enumerate(line.bends):
-            if change := line.slopes[k + 1] - line.slopes[k]:
-                ramp = program.function("leaky", program.combine([(1, x)], -bend_at))
-                u, h = [*u, (change, ramp)], [*h, (change / 2, program.square(ramp))]
-        squared = program.combine([(1 / r, program.square(x))], kink * kink / r)
-        u.append((1 / r, _error(program, x, OF_U, OF_U * kink)))
-        h.append((1.0, _error(program, squared, OF_H)))
-        controls.append(program.combine(u, line.u, operations=len(u) + 2))
-        values.append((1.0, program.combine(h, line.h, operations=len(h) + 2)))
-    return controls, program.combine(values, operations=m)
-
-
-def _error(program: Program, x: Entry, relative: float, absolute: float = 0.0) -> Entry:
-    """0 ± (relative · |x| + absolute)."""
-    return program.combine([(1, program.rounded(x, relative, absolute, math.inf)), (-1, x)])
-
-
-class _Line(NamedTuple):
-    """u(b) = argmin over low ≤ u ≤ high of ½ru² + bu + w|u|, a piecewise linear function."""
-
-    r: float
-    w: float
-    bends: list[float]  # βₖ, increasing
-    slopes: list[float]  # left of the first, between them, and right of the last
-    u: float  # at the first bend
-    h: float  # the minimum there
-
-    @staticmethod
-    def of(r: float, w: float, low: float, high: float) -> "_Line":
-        def u(b: float) -> float:
-            free = -math.copysign(max(abs(b) - w, 0.0), b) / r
-            return min(max(free, low), high)
-
-        kinks = [-w, w] if low < 0 < high else []
-        ends = [-(r * high + math.copysign(w, high or -1)), -(r * low + math.copysign(w, low or 1))]
-        bends = sorted({0.0 + each for each in (*kinks, *ends) if math.isfinite(each)}) or [0.0]
-        inner = [-1 / r if u(left) != u(right) else 0.0 for left, right in itertools.pairwise(bends)]
-        outer = [-1 / r if math.isinf(side) else 0.0 for side in (high, low)]
-        at = u(bends[0])
-        value = (r / 2 * at + bends[0]) * at + w * abs(at)
-        return _Line(r, w, bends, [outer[0], *inner, outer[1]], at, value)
 
 
 RULES: dict[Any, Rule] = {LEAST: _least}

@@ -288,7 +288,8 @@ class ControlBox(ControlSet):
         ]  # with u₁ at a limit
         determinant = R[..., 0, 0] * R[..., 1, 1] - R[..., 0, 1] * R[..., 0, 1]
         free = (R[..., 0, 1] * b[..., 0] - R[..., 0, 0] * b[..., 1]) / (2 * determinant)
-        middle = free.clamp(torch.minimum(*roots), torch.maximum(*roots))
+        # clamp has no derivative by equal bounds, which the roots are for a diagonal R
+        middle = torch.minimum(torch.maximum(free, torch.minimum(*roots)), torch.maximum(*roots))
         second = middle.clamp(low[1], high[1])
         first = (-(b[..., 0] + 2 * R[..., 0, 1] * second) / (2 * R[..., 0, 0])).clamp(low[0], high[0])
         return torch.stack([first, second], -1)

@@ -325,3 +325,15 @@ def test_limits_without_meaning_are_refused(lower, upper, reason):
 def test_limits_of_another_number_of_controls_are_refused(m):
     with pytest.raises(ValueError, match=f"Expected limits of {m} controls, got 2"):
         ControlBox([-1.0, -1.0], [1.0, 1.0]).minimise(torch.eye(m), torch.ones(m))
+
+
+def test_two_controls_that_are_not_coupled_have_their_derivatives():
+    """Their roots are equal up to rounding, between which clamp would have no derivative."""
+    R = torch.diag_embed(0.1 + torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)))
+    b = (0.3 * torch.randn(1000, 2, generator=torch.Generator().manual_seed(1))).requires_grad_()
+    u = ControlBox([-2.0, -0.6], [2.0, 0.6]).minimise(R, b)
+    inside = u[:, 1].abs() < 0.6
+    (slope,) = torch.autograd.grad(u[:, 1].sum(), b)
+    assert_close(slope[inside][:, 1], -0.5 / R[inside][:, 1, 1])
+    assert not slope[~inside][:, 1].any()
+    assert 0 < inside.double().mean() < 1

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from lyapnet.task.horizon import Horizon
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
-    from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+    from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
     from lyapnet.training.modules import ValueModule
@@ -91,7 +91,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "loop.rollout": ["Rollout", "Trajectory"],
     "task.ball": ["ControlBall"],
     "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
-    "task.systems": ["SYSTEMS", "ControlAffineSystem"],
+    "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
     "training.modules": ["ValueModule"],
@@ -115,6 +115,7 @@ __all__ = [
     "ControlCost",
     "ControlCosts",
     "ControlSet",
+    "ControlSystem",
     "Controller",
     "Cost",
     "EntropyCost",

@@ -70,9 +70,9 @@ from lyapnet.claims import funnel, preconditions  # noqa: E402
 from lyapnet.loop.rollout import routines  # noqa: E402
 from lyapnet.prover import bounds, counterexamples  # noqa: E402
 from lyapnet.task.cost import QuadraticCost  # noqa: E402
-from lyapnet.task.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem  # noqa: E402
 from lyapnet.value.networks import FCN, Scaling  # noqa: E402
-from tests.problems import Quadratic  # noqa: E402
+from tests.problems import AFFINE, Quadratic  # noqa: E402
 
 pytest_plugins = ("tests.gate",)
 
@@ -164,7 +164,7 @@ def _form_of_rollouts(traced, monkeypatch):
 def build_system():
     """name ↦ system; a registered system that cannot be built fails the tests."""
 
-    def build(name: str) -> ControlAffineSystem:
+    def build(name: str) -> ControlSystem:
         try:
             return SYSTEMS[name](**ARGUMENTS.get(name, {}))
         except TypeError as error:
@@ -175,9 +175,9 @@ def build_system():
     return build
 
 
-@pytest.fixture(params=SYSTEMS)
+@pytest.fixture(params=AFFINE)
 def system(request, build_system) -> ControlAffineSystem:
-    """Each registered system in turn, present and future."""
+    """Each registered control-affine system in turn, present and future."""
     return build_system(request.param)
 
 

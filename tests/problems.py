@@ -15,7 +15,7 @@ from lyapnet.task.cost import Cost, QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet, Unbounded
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Expansion
 from lyapnet.value.networks import ExpansionNetwork
@@ -23,6 +23,7 @@ from lyapnet.value.policy import HJBPolicy, SampledPolicy
 
 CONF = Path(__file__).parents[1] / "conf"
 AMPLE = 300.0  # wall seconds that no proof of a test takes, on a busy machine too: what bounds it is its boxes
+AFFINE = [name for name, cls in SYSTEMS.items() if issubclass(cls, ControlAffineSystem)]
 KINDS = ("double_integrator", "cartpole", "reacher", "satellite")  # systems, one of each kind of f, g and R
 
 

@@ -65,6 +65,12 @@ def certify(
         run.require_used_by(claim)
         if not claim.allows_noise:
             require_no_noise(controller.problem, claim.kind)
+        system = controller.problem.system
+        if not system.affine and not claim.allows_any_dynamics:
+            raise UsageError(
+                f"Expected a control-affine system for a {claim.kind} certificate, got {system.title}; sampled and "
+                "statistical certificates take any."
+            )
         claim.require_law(controller)
         if controller.problem.follows_reference and not claim.allows_reference:
             raise UsageError(

@@ -171,6 +171,7 @@ class Claim(ABC):
     )  # the resources of a run that it can use
     allows_noise: ClassVar[bool] = False  # whether it is a claim about closed loops under noise too
     allows_reference: ClassVar[bool] = False  # whether the goal may move with the time on a reference
+    allows_any_dynamics: ClassVar[bool] = False  # whether the system need not be control-affine
     share_of_two: ClassVar[float | None] = (
         None  # of the seconds, if a bound from below follows; None if the claim bounds no cost
     )

@@ -43,6 +43,7 @@ class Sampled(Claim):
     means: ClassVar[Sequence[str]] = ()
     allows_noise: ClassVar[bool] = True
     allows_reference: ClassVar[bool] = True
+    allows_any_dynamics: ClassVar[bool] = True
 
     samples: int = option(100, "Initial states to draw.", at_least=1, remedy="choose how many")
     radius: float | None = option(None, RADIUS, at_least=0, remedy=NORM)
@@ -66,6 +67,7 @@ class Statistical(Claim):
     means: ClassVar[Sequence[str]] = ()
     allows_noise: ClassVar[bool] = True
     allows_reference: ClassVar[bool] = True
+    allows_any_dynamics: ClassVar[bool] = True
 
     samples: int = option(10_000, "Initial states to draw.", at_least=1, remedy="choose how many")
     confidence: float = option(1 - 1e-6, "Confidence of the bound.", above=0, below=1, remedy="for example 0.999999")

@@ -18,7 +18,7 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_constant_states
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
@@ -98,18 +98,18 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
     return plants
 
 
-def _builder(controller: Controller) -> Callable[[Mapping[str, float]], ControlAffineSystem]:
+def _builder(controller: Controller) -> Callable[[Mapping[str, float]], ControlSystem]:
     """A function that builds the controller's system with other parameters, in the controller's precision."""
     cls, given, dtype = type(controller.system), controller.parameters, controller.initial_states.lower.dtype
 
-    def build(values: Mapping[str, float]) -> ControlAffineSystem:
+    def build(values: Mapping[str, float]) -> ControlSystem:
         with section(OPTION), float64_defaults():
             return cls(**{**given, **values}).to(dtype).double()
 
     return build
 
 
-def _require_arguments(system: ControlAffineSystem, names: Mapping[str, Any]) -> None:
+def _require_arguments(system: ControlSystem, names: Mapping[str, Any]) -> None:
     """Refuse names that are not arguments of the system's constructor."""
     cls = type(system)
     known = [name for name in inspect.signature(cls).parameters if not name.startswith(PREFIX)]

@@ -18,7 +18,7 @@ from lyapnet.experiment.config import Config
 from lyapnet.task.constraints import names_of
 from lyapnet.task.cost import MadeOfAnother, QuadraticCost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem
-from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+from lyapnet.task.systems import SYSTEMS, ControlSystem
 
 
 def require_writable(figure: Path | None, folder: Path | None, keep: str | None = None) -> None:
@@ -202,7 +202,7 @@ def _system(controller: Controller, config: Config) -> dict[str, Any]:
     return {"name": f"family of {_name(system.system)}", "parameters": fixed}
 
 
-def _name(system: ControlAffineSystem) -> str:
+def _name(system: ControlSystem) -> str:
     """The name of a registered system, else module:Class."""
     cls = type(system)
     return next((name for name, known in SYSTEMS.items() if known is cls), f"{cls.__module__}:{cls.__qualname__}")
@@ -222,7 +222,7 @@ def _controls(controller: Controller, config: Config) -> dict[str, Any]:
     return dict(zip(("lower", "upper"), finite, strict=True))
 
 
-def _family_cost_words(system: ControlAffineSystem) -> list[str]:
+def _family_cost_words(system: ControlSystem) -> list[str]:
     """Descriptions of what differs between the costs of a family's members."""
     assert isinstance(system, FamilySystem)
     moving = ", ".join(name for name in system.names if name.startswith(PREFIX))

@@ -31,7 +31,7 @@ from lyapnet.task.family import FamilySystem
 from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.after_horizon import AfterHorizon, choose_law
 from lyapnet.value.at_parameters import AtParameters
 from lyapnet.value.calculus import ValueFunction
@@ -41,7 +41,7 @@ from lyapnet.value.policy import HJBPolicy, ValuePolicy, gain_over_step, known_l
 MAX_LAW_DIFFERENCE = 0.2  # relative difference of V's HJB and sampled law without a note; about 1 % of the cost
 
 
-def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
+def parameters_of(system: ControlSystem, config: SystemConfig) -> dict[str, Any]:
     """The constructor's arguments of a config's system, including defaults; empty if they do not fit the system."""
     try:
         bound = inspect.signature(type(system)).bind(**config.parameters)
@@ -165,7 +165,7 @@ class Controller:
         return {} if self._config is None else parameters_of(self.system, self._config.system)
 
     @property
-    def system(self) -> ControlAffineSystem:
+    def system(self) -> ControlSystem:
         """ẋ = f(x) + g(x)u."""
         return self.problem.system
 

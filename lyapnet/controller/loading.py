@@ -27,7 +27,7 @@ from lyapnet.loop.programs import Program
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.cost import Cost
 from lyapnet.task.sets import ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.after_horizon import REMEDY, from_plain
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.linearisation import smooth_kinks
@@ -36,7 +36,7 @@ from lyapnet.value.linearisation import smooth_kinks
 def load(
     path: str | Path,
     *,
-    system: ControlAffineSystem | None = None,
+    system: ControlSystem | None = None,
     network: type[ValueFunction] | None = None,
     cost: Cost | None = None,
     controls: ControlSet | None = None,
@@ -96,7 +96,7 @@ def _controller_of(
     return Controller(problem, V, rollout, own, config, beyond, parts, after_horizon=after_horizon, origin=origin)
 
 
-def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:
+def _require_dimension(config: Config, system: ControlSystem | None, path: str | Path) -> None:
     """Raise UsageError if a replaced system has another number of states than the checkpoint's X₀."""
     if system is None or len(lower := config.initial_states.lower) == 1:  # a single bound may hold for every state
         return

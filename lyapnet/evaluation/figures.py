@@ -22,7 +22,7 @@ from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import StateLimits, parts_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem, moving_states
+from lyapnet.task.systems import ControlSystem, moving_states
 
 MOST_PANELS = 12  # states, and controls, that a figure over time has a panel for
 MOST_NAMED = 4  # other states whose values fit into a line under a slice
@@ -134,7 +134,7 @@ def _draw_line_region(
     figure: Figure,
     axes: Axes,
     region: Slice,
-    system: ControlAffineSystem,
+    system: ControlSystem,
     violation: Tensor,
     V0: Tensor,
     tolerance: float,
@@ -151,12 +151,12 @@ def _draw_line_region(
     legend_below(figure, [*axes.get_legend_handles_labels()[0], *twin.get_legend_handles_labels()[0]], columns=3)
 
 
-def states_and_controls_to_draw(system: ControlAffineSystem) -> tuple[list[int], list[int]]:
+def states_and_controls_to_draw(system: ControlSystem) -> tuple[list[int], list[int]]:
     """The indices of the first MOST_PANELS states that move, and of the first MOST_PANELS controls."""
     return moving_states(system)[:MOST_PANELS], list(range(system.m))[:MOST_PANELS]
 
 
-def name_panels_left_out(figure: Figure, system: ControlAffineSystem) -> None:
+def name_panels_left_out(figure: Figure, system: ControlSystem) -> None:
     """Say above a figure how many states and controls have no panel, if there are some."""
     states = len(moving_states(system))
     if max(states, system.m) > MOST_PANELS:
@@ -293,7 +293,7 @@ def optimality(table: StateTable) -> Figure:
     return figure
 
 
-def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Sequence[int]) -> str:
+def _others_at_center(system: ControlSystem, initial_states: Box, axes: Sequence[int]) -> str:
     center, others = initial_states.center.tolist(), [i for i in range(system.n) if i not in axes]
     if len(others) > MOST_NAMED:
         return "the other states at the centre of X₀"

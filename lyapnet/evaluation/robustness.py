@@ -19,20 +19,20 @@ from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 BEYOND = 0.2  # relative change of X₀'s extent and of each physical parameter
 EARTH = (9.7, 9.9)  # m/s²: a parameter `gravity` between these is that of the Earth, which is what it is
 NOISE = 0.01  # standard deviation of the measured x_i, relative to the largest |x_i| of the undisturbed loop
 
 
-def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
+def physical_parameters(system: ControlSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
     """The parameters that are varied, see `unchanged_parameters`."""
     unchanged = unchanged_parameters(system, parameters)
     return {name: float(value) for name, value in parameters.items() if name not in unchanged}
 
 
-def unchanged_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, str]:
+def unchanged_parameters(system: ControlSystem, parameters: Mapping[str, Any]) -> dict[str, str]:
     """Name ↦ reason of a constructor's arguments of which no share is taken: all but positive real numbers.
 
     An integer counts as real if the constructor expects a float, as for a mass of 1 kg, but not for 3 links.

@@ -15,7 +15,7 @@ from lyapnet.evaluation.intervals import CONFIDENCE, half_width_of_mean
 from lyapnet.evaluation.under_noise import LOST_EXCESS
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.loop.random_plants import RandomPlants
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.expansions import path_under
 
 RARE = 0.999  # probability of errors that are not rare
@@ -39,7 +39,7 @@ class EstimatedLoops(NamedTuple):
         error = self.x - self.x_hat
         return (error * torch.linalg.solve(self.P, error)).sum(-1)
 
-    def estimated(self, system: ControlAffineSystem) -> "EstimatedLoops":
+    def estimated(self, system: ControlSystem) -> "EstimatedLoops":
         """The loops without the settings of a family, which are known."""
         kept = [i for i in range(system.n) if i not in system.settings]
         return self._replace(x=self.x[..., kept], x_hat=self.x_hat[..., kept], P=self.P[..., kept, :][..., kept])

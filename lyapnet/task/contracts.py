@@ -10,7 +10,7 @@ from lyapnet.base.contracts import check_result
 from lyapnet.base.types import Control, State
 from lyapnet.task.cost import Cost
 from lyapnet.task.sets import ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
 class Contract(NamedTuple):
@@ -30,9 +30,11 @@ class Contract(NamedTuple):
         check_result(self.name, self.function, arguments, self.shape, self.dtype)
 
 
-def contracts_of_system(system: ControlAffineSystem) -> list[Contract]:
-    """f and g, functions of x."""
+def contracts_of_system(system: ControlSystem) -> list[Contract]:
+    """f and g, functions of x; none of a system that is not control-affine."""
     name, n, m = type(system).__name__, system.n, system.m
+    if not system.affine:
+        return []
     return [Contract(f"{name}.f(x)", system.f, (n,)), Contract(f"{name}.g(x)", system.g, (n, m))]
 
 
@@ -46,7 +48,7 @@ def contracts_of_cost(cost: Cost, m: int) -> list[Contract]:
     ]
 
 
-def check_shapes_of_system(system: ControlAffineSystem, x: State) -> None:
+def check_shapes_of_system(system: ControlSystem, x: State) -> None:
     """Check the shapes of f, g and ẋ at states (b, n).
 
     Raises:

@@ -17,7 +17,7 @@ from torch import Tensor
 from lyapnet.base.types import ControlMatrix, PerState, State, StatePath
 from lyapnet.task.cost import Cost, MadeOfAnother, PenaltyCost, SmoothedCost
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlAffineSystem, ControlSystem
 
 # Lengths are relative to a state's size, see `size_of`.
 INNER_MARGIN = 1e-9  # distance inside a border at which functions are evaluated
@@ -99,12 +99,12 @@ class Domain:
         return (self._outside(x).abs() > slack).any(-1).any(0)
 
 
-def within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
+def within(system: ControlSystem, domain: Domain) -> ControlSystem:
     """A copy of a system whose f and g are evaluated at the nearest state of a domain; its class has the same name."""
     return _restrict(copy.deepcopy(system), domain)
 
 
-def _restrict(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
+def _restrict(system: ControlSystem, domain: Domain) -> ControlSystem:
     """Give a system a new subclass whose functions are evaluated inside the domain."""
 
     def at_nearest(function: Callable[..., Any]) -> Callable[..., Any]:

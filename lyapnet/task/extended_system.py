@@ -9,10 +9,10 @@ from torch import Tensor
 
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, State
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
-class ExtendedSystem(ControlAffineSystem):
+class ExtendedSystem(ControlSystem):
     """ẋ = f(x; s) + g(x; s)u with further states s, which no control moves; constant unless `rates` says otherwise.
 
     Args:
@@ -20,7 +20,7 @@ class ExtendedSystem(ControlAffineSystem):
         names, units: of s.
     """
 
-    def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
+    def __init__(self, system: ControlSystem, names: Sequence[str], units: Sequence[str]):
         super().__init__()
         self.system = system
         self.state_names = (*system.state_names, *names)
@@ -33,7 +33,7 @@ class ExtendedSystem(ControlAffineSystem):
         """(x, s)."""
         return z[..., : self.system.n], z[..., self.system.n :]
 
-    def at(self, s: Tensor) -> ControlAffineSystem:
+    def at(self, s: Tensor) -> ControlSystem:
         """The system in x for s (*batch, k)."""
         return self.system
 
@@ -59,6 +59,10 @@ class ExtendedSystem(ControlAffineSystem):
     def g(self, x: State) -> InputMatrix:
         x, s = self.split(x)
         return self._with_zero_rows(self.at(s).g(x))
+
+    @property
+    def affine(self) -> bool:
+        return self.system.affine
 
     def dynamics(self, x: State, u: Control) -> State:
         x, s = self.split(x)

@@ -27,8 +27,9 @@ from lyapnet.task.cost import Cost, DiagonalWeights, with_matrices
 from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem, functions_of_state
 
+GENERIC_CONTROL = 0.3  # each control at which dynamics that are not affine are compared
 MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
 ROUNDING = 1e-14  # coefficients of targets below this count as zero, relative to the largest state or control
 LOGARITHM = "log10 "  # begins the names of states that are logarithms of weights
@@ -49,7 +50,7 @@ class FamilySystem(ExtendedSystem):
     """
 
     def __init__(
-        self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str], weights: Collection[str] = ()
+        self, system: ControlSystem, names: Sequence[str], units: Sequence[str], weights: Collection[str] = ()
     ):
         super().__init__(system, [f"{LOGARITHM}{name}" if name in weights else name for name in names], units)
         self.names, self.weights = tuple(names), frozenset(weights)
@@ -88,11 +89,11 @@ class FamilySystem(ExtendedSystem):
         """The parameters by name, weights as such, from the entries of p."""
         return {name: 10**each if name in self.weights else each for name, each in zip(self.names, p, strict=True)}
 
-    def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
+    def member(self, p: Float[Tensor, "*batch k"]) -> ControlSystem:
         """The system with parameters (k,), or with different ones for each of a batch of states."""
         return with_attributes(self.system, {name: p[..., i] for name, i in self.parameters_in_f.items()})
 
-    def at(self, s: Tensor) -> ControlAffineSystem:
+    def at(self, s: Tensor) -> ControlSystem:
         return self.member(s)
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
@@ -255,7 +256,7 @@ def family_cost_of(cost: Any) -> FamilyCost:
     return cost
 
 
-def with_constant_states(problem: Problem, system: ControlAffineSystem, initial_states: Box) -> Problem:
+def with_constant_states(problem: Problem, system: ControlSystem, initial_states: Box) -> Problem:
     """A problem in z = (x, p), with constants p that only its system knows; all else is that of x.
 
     Args:
@@ -280,7 +281,7 @@ def _expand_parameter(x: State, name: str, value: Any) -> PerState:
         raise ValueError(f"Expected {name} scalar or of shape {batch}, got {got}; give a number per state.") from error
 
 
-def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> ControlAffineSystem:
+def with_attributes(system: ControlSystem, values: Mapping[str, Any]) -> ControlSystem:
     """A shallow copy of a system with some attributes replaced."""
     member = copy.copy(system) if values else system
     for name, value in values.items():
@@ -290,7 +291,7 @@ def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> C
 
 def check_members(
     family: FamilySystem,
-    build: Callable[[Mapping[str, float]], ControlAffineSystem],
+    build: Callable[[Mapping[str, float]], ControlSystem],
     z: State,
     called: str = "parameters of a family",
 ) -> None:
@@ -311,7 +312,8 @@ def check_members(
             f"{unused[0]}; write self.{unused[0]} = {unused[0]} in its __init__, and read it in f and g."
         )
     try:
-        f, g = family.f(z), family.g(z)
+        functions = functions_of_state(family, z.new_full((family.m,), GENERIC_CONTROL))
+        values = {name: function(z) for name, function in functions.items()}
     except Exception as error:  # f and g may be the user's
         raise UsageError(
             f"Expected {cls}.f and g that take {', '.join(names)} as a tensor, one number for each state, got "
@@ -324,7 +326,8 @@ def check_members(
         )
     for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
         member = build(_values(family, p)).to(z)
-        for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
+        for name, function in functions_of_state(member, z.new_full((family.m,), GENERIC_CONTROL)).items():
+            own, expected, symbol = values[name], function(x), name.partition("(")[0]
             got = own[i][: len(x)] if own.ndim > 1 and len(own) == len(z) else own
             if got.shape != expected.shape or not torch.allclose(got, expected, MEMBER_TOLERANCE, MEMBER_TOLERANCE):
                 raise UsageError(
@@ -342,7 +345,7 @@ def _values(family: FamilySystem, p: Tensor) -> dict[str, float]:
 
 
 def _require_same_operations(
-    family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State
+    family: FamilySystem, build: Callable[[Mapping[str, float]], ControlSystem], z: State
 ) -> None:
     """Require that members equal newly constructed systems with the same parameters, at all states.
 
@@ -409,7 +412,7 @@ class _ComparisonRecorder(list[float]):
         return found
 
 
-def _traced_operations(system: ControlAffineSystem, values: Mapping[str, float], z: State) -> Any:
+def _traced_operations(system: ControlSystem, values: Mapping[str, float], z: State) -> Any:
     """The traced operators and constants of a system's functions, with parameters as numbers and as tensors.
 
     None if they cannot be traced; certificates are then impossible too.
@@ -419,7 +422,8 @@ def _traced_operations(system: ControlAffineSystem, values: Mapping[str, float],
     def asked(x: Tensor, u: Tensor, *p: Tensor) -> tuple[Tensor, ...]:
         here = with_attributes(system, dict(zip(values, p[0].unbind(-1), strict=True))) if p else system
         weight = getattr(here, "inverse_mass", None)
-        return here.f(x), here.g(x), here.dynamics(x, u), *([] if weight is None else [weight(x)])
+        parts = [] if not here.affine else [here.f(x), here.g(x)]
+        return *parts, here.dynamics(x, u), *([] if weight is None else [weight(x)])
 
     try:
         p = torch.tensor([*values.values()]).to(z)
@@ -435,6 +439,7 @@ def _unused_parameters(family: FamilySystem, z: State) -> list[str]:
     with torch.enable_grad():
         read = {name: p[:, k].clone().requires_grad_() for name, k in family.parameters_in_f.items()}
         member = with_attributes(family.system, read)
-        total = member.f(x).sum() + member.g(x).sum() + 0 * x.new_zeros((), requires_grad=True)
+        functions = functions_of_state(member, z.new_full((family.m,), GENERIC_CONTROL))
+        total = 0 * x.new_zeros((), requires_grad=True) + sum(function(x).sum() for function in functions.values())
         found = torch.autograd.grad(total, [*read.values()], allow_unused=True)
     return [name for name, gradient in zip(read, found, strict=True) if gradient is None]

@@ -11,7 +11,7 @@ from lyapnet.task.noise import Noise as NoiseOfTask
 from lyapnet.task.noise import SystemNoise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
 class DisturbedSystem(ExtendedSystem):
@@ -22,7 +22,7 @@ class DisturbedSystem(ExtendedSystem):
         controls: indices of the controls that d disturbs, which E selects.
     """
 
-    def __init__(self, system: ControlAffineSystem, controls: Sequence[int]):
+    def __init__(self, system: ControlSystem, controls: Sequence[int]):
         names = [f"disturbance of {system.control_names[i]}" for i in controls]
         super().__init__(system, names, [system.control_units[i] for i in controls])
         self.disturbed = list(controls)

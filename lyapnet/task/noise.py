@@ -14,7 +14,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import State
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 Increments = Float[Tensor, "steps *batch sources"]  # ΔW of each step, in √s
 
@@ -84,7 +84,7 @@ class SystemNoise(Noise):
         UsageError: the method fails, or returns no matrix with a column.
     """
 
-    def __init__(self, system: ControlAffineSystem, like: State):
+    def __init__(self, system: ControlSystem, like: State):
         super().__init__()
         self.system = system
         name, noise = f"{type(system).__name__}.noise(x)", system.noise

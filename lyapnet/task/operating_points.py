@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lyapnet.base.types import Control, State
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 HELD = 1e-9  # largest rate of a held state, in units of the rates on X₀
 INITIAL_GUESSES = 8  # initial states in X₀, and as many in a box twice as wide and in one ten times as wide
@@ -52,7 +52,7 @@ class OperatingPoints:
 
     def __init__(
         self,
-        system: ControlAffineSystem,
+        system: ControlSystem,
         controls: ControlSet,
         initial_states: Box,
         state_limits: tuple[Tensor, Tensor] | None = None,
@@ -68,7 +68,7 @@ class OperatingPoints:
             self.low, self.high = (side.double().expand(system.m).clone() for side in controls.limits)
         with torch.no_grad():
             x = initial_states.sample(RATE_STATES, torch.Generator().manual_seed(0)).double()
-            f, g = system.f(x).nan_to_num(0, 0, 0), system.g(x).nan_to_num(0, 0, 0)
+            f, g = (part.nan_to_num(0, 0, 0) for part in system.affine_model(x, x.new_zeros(len(x), system.m)))
             holding = (torch.linalg.pinv(g) @ f[..., None])[..., 0].abs().amax(0)
             limits = torch.stack([self.low.abs(), self.high.abs()]).nan_to_num(posinf=0).amax(0)
             usual = limits.where(limits > 0, holding)
@@ -183,7 +183,8 @@ class OperatingPoints:
 
     def _point(self, x: State, u: Control) -> OperatingPoint:
         with torch.no_grad():
-            rate = (self.system.f(x) + self.system.g(x) @ u) / self.rate
+            f, g = self.system.affine_model(x, u)
+            rate = (f + g @ u) / self.rate
         within = [
             bool((x[i] >= low) & (x[i] <= high)) for i, (low, high) in enumerate(zip(*self.state_limits, strict=True))
         ]
@@ -194,8 +195,8 @@ class OperatingPoints:
         n = self.system.n
         with torch.enable_grad():
             copies = x.detach().expand(n, n).clone().requires_grad_()  # all rows of the Jacobian in one backward pass
-            g = self.system.g(copies)
-            rate = self.system.f(copies) + (g @ u.detach()[:, None])[..., 0]
+            f, g = self.system.affine_model(copies, u.detach().expand(n, -1))
+            rate = f + (g @ u.detach()[:, None])[..., 0]
             by_x = torch.zeros(n, n, dtype=torch.float64)
             if rate.requires_grad:
                 (by_x,) = torch.autograd.grad(rate.diagonal().sum(), copies, materialize_grads=True)

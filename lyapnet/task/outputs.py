@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.contracts import check_function
 from lyapnet.base.types import State
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 Readings = Float[Tensor, "*batch p"]
 
@@ -75,7 +75,7 @@ class MeasuredStates(Outputs):
         noise: standard deviation of each reading, in the unit of its state.
     """
 
-    def __init__(self, system: ControlAffineSystem, states: Sequence[int], noise: Sequence[float]):
+    def __init__(self, system: ControlSystem, states: Sequence[int], noise: Sequence[float]):
         super().__init__(noise)
         if len(states) != self.count or len(set(states)) < len(states):
             raise ValueError(
@@ -106,7 +106,7 @@ class SystemOutput(Outputs):
         UsageError: h breaks its contract; says how.
     """
 
-    def __init__(self, system: ControlAffineSystem, noise: Sequence[float], x: State):
+    def __init__(self, system: ControlSystem, noise: Sequence[float], x: State):
         super().__init__(noise)
         self.system: Any = system
         check_function(f"{type(system).__name__}.output(x)", self, [x], (self.count,))

@@ -1,7 +1,7 @@
 """The optimal control problem, the common argument of optima, rollouts, certificates and environments."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_bor
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.task.noise import Noise, SystemNoise
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem, functions_of_state
 
 GOAL_TEST_STEPS = 200  # largest number of steps in the test whether a task has a goal
 TRIED = 64  # states at which users' functions are tested
@@ -66,7 +66,7 @@ class Problem(nn.Module):
             negative or not finite.
     """
 
-    system: ControlAffineSystem
+    system: ControlSystem
     cost: Cost
     controls: ControlSet
     initial_states: Box
@@ -78,7 +78,7 @@ class Problem(nn.Module):
 
     def __init__(
         self,
-        system: ControlAffineSystem,
+        system: ControlSystem,
         cost: Cost,
         controls: ControlSet,
         initial_states: Box,
@@ -100,6 +100,11 @@ class Problem(nn.Module):
                     f"Expected {name} of {type(cost).__name__} of shape ({expected},), got {tuple(given.shape)}; give "
                     "one number for each."
                 )
+        if not (system.affine or (controls.is_box and controls.limits is not None)):
+            raise UsageError(
+                f"Expected limits of each control, or none, for a system that is not control-affine, got "
+                f"{type(controls).__name__}; take controls.lower and controls.upper for {system.title}."
+            )
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
         self.noise = SystemNoise(system, initial_states.center) if noise is None and system.noisy else noise
@@ -172,6 +177,16 @@ class Problem(nn.Module):
         rest = self.cost.rest_at(x)
         return (x.new_zeros(self.system.m) if rest is None else rest.to(x)).expand(*x.shape[:-1], -1)
 
+    def nominal_at(self, x: State) -> Control:
+        """The control about which dynamics that are not affine are linearised: that at rest, projected onto U."""
+        rest = self.rest_at(x)
+        return rest if self.system.affine else self.controls.project(rest)
+
+    @property
+    def functions_of_state(self) -> dict[str, Callable[[State], Tensor]]:
+        """f(x) and g(x) by their names; of a system that is not control-affine, ẋ under the nominal control."""
+        return functions_of_state(self.system, self.nominal_at(self.goal))
+
     def rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The means of ẋ and ℓ over one step from x with u held, by the integrator of the horizon."""
         rate, cost = self.smooth_rates(x, u)
@@ -217,7 +232,9 @@ class Problem(nn.Module):
             return self._euler_response(x, u)
         n, recording = self.system.n, torch.is_grad_enabled()
         around = self.cost.rest_at(x) if u is None else u
-        u = self.rest_at(x) if u is None else u
+        if u is None:
+            u = self.nominal_at(x)
+            around = around if self.system.affine else u
         with torch.enable_grad():
             u = u if recording and u.requires_grad else u.detach().requires_grad_()
             # one copy of u for each component of ẋ: all rows of the Jacobian in one backward pass
@@ -245,6 +262,10 @@ class Problem(nn.Module):
 
     def _euler_response(self, x: State, u: Control | None) -> Response:
         rest = self.cost.rest_at(x)
+        if not self.system.affine:
+            u, R2 = self.nominal_at(x) if u is None else u, 2 * self.cost.R(x)
+            after, by_control = x + self.horizon.dt * self.system.dynamics(x, u), self.system.affine_model(x, u)[1]
+            return Response(after, by_control, apply(R2, u if rest is None else u - rest), R2, u)
         if u is None:
             rest = None if rest is None else rest.expand(*x.shape[:-1], -1)
             rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest)
@@ -294,7 +315,8 @@ class Problem(nn.Module):
         """The borders of each state beyond which f, g, q or φ are undefined; empty if they are finite everywhere."""
         own = copied(self)
         system, cost = own.system, own.cost
-        functions = {"f": system.f, "g": system.g, "q": cost.state, "φ": cost.terminal}
+        functions = {name.removesuffix("(x)"): function for name, function in own.functions_of_state.items()}
+        functions |= {"q": cost.state, "φ": cost.terminal}
         try:
             return find_borders(functions, own.initial_states, system.state_names)
         except Exception:  # a user's function may raise an error at such states
@@ -337,7 +359,10 @@ class Problem(nn.Module):
         cost.check(x)
         own._check_constraints(x)
         b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
-        if not torch.allclose(system.dynamics(x, b), ControlAffineSystem.dynamics(system, x, b), rtol=1e-6):
+        if not system.affine:
+            u = own.controls.project(b[:TRIED])
+            check_function(f"{name}.dynamics(x, u)", system.dynamics, [x[:TRIED], u], (n,))
+        elif not torch.allclose(system.dynamics(x, b), system.f(x) + apply(system.g(x), b), rtol=1e-6):
             raise UsageError(
                 f"Expected {name}.dynamics(x, u) = f(x) + g(x)u, got another sum; a class that overrides f or g of "
                 "another system may have to override its dynamics too."
@@ -442,7 +467,7 @@ class Problem(nn.Module):
         b = torch.tensor([[1e4], [-1e4], [1.0]], dtype=x.dtype).expand(-1, m)  # beyond the limits of bounded sets
         with torch.no_grad():
             numbers = {
-                "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
+                "x": x, **own._recorded_dynamics(x), "q": cost.state(x), "R": cost.R(x),
                 "φ": cost.terminal(x), "U": own.controls.minimise(torch.eye(m, dtype=x.dtype).expand(3, m, m), b),
             }  # fmt: skip
         if (rest := cost.rest_at(x)) is not None:
@@ -461,6 +486,14 @@ class Problem(nn.Module):
             for side, limit in zip(LIMITS, own.controls.limits, strict=True):
                 numbers[side] = limit.to(x).expand(1, m)
         return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
+
+    def _recorded_dynamics(self, x: State) -> dict[str, Tensor]:
+        """f and g at some states; or ẋ under the control at rest, and under others beside it."""
+        if self.system.affine:
+            return {"f": self.system.f(x), "g": self.system.g(x)}
+        rest = self.nominal_at(x)
+        others = [self.controls.project(rest + side) for side in (0.0, 0.3, -0.3)]
+        return {"ẋ": torch.stack([self.system.dynamics(x, u) for u in others], 1)}
 
     def differences(self, record: Any) -> list[str]:
         """The parts in which the problem differs from a record; empty if there is no record for this X₀."""

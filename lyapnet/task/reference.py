@@ -5,7 +5,7 @@ from torch import Tensor
 
 from lyapnet.base.types import State
 from lyapnet.task.extended_system import ExtendedSystem
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
 class TimedSystem(ExtendedSystem):
@@ -16,7 +16,7 @@ class TimedSystem(ExtendedSystem):
         period: of the reference; None: it does not repeat.
     """
 
-    def __init__(self, system: ControlAffineSystem, period: float | None):
+    def __init__(self, system: ControlSystem, period: float | None):
         super().__init__(system, ["reference time"], ["s"])
         self.period = period
         self.settings = (*system.settings, system.n)

@@ -23,7 +23,18 @@ from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.calculus import ValueFunction
-from lyapnet.value.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
+from lyapnet.value.expansions import (
+    FLOOR,
+    Optimum,
+    Path,
+    derivatives_of,
+    held_control,
+    in_float64,
+    penalty_of_one_step,
+    sizes,
+    step_objective,
+    without_penalty,
+)
 from lyapnet.value.policy import LookaheadPolicy
 
 BATCH_SIZE = 512  # examples in a step
@@ -177,8 +188,8 @@ def _reference_controls(problem: Problem, ahead: bool) -> Sequence[bool]:
     constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one
     step itself, so rows at the best control are sufficient.
     """
-    if not ahead:
-        return [False]
+    if not ahead or not problem.system.affine:  # the search of the latter does not begin anew with V
+        return [ahead]
     return [True] if problem.constraints is not None else [False, True]
 
 
@@ -229,8 +240,9 @@ def _within_ranges(problem: Problem, x: StatePath, deviation: Tensor) -> Tensor:
 def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:
     """The columns of the examples at given deviations from the nodes of some optima.
 
-    The reference control is the best control or the control at rest. The constraint penalty of one step is not
-    quadratic; its exact value is used.
+    The reference control is the best control or the control at rest. For a system that is not affine it is the best
+    one, as W says nothing of others, though V is evaluated where the law evaluates it. The constraint penalty of one
+    step is not quadratic; its exact value is used.
     """
     (x, value, gradient, hessian), dt = without_penalty(problem, optimum.expansion), problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
@@ -248,11 +260,22 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
         return answer.x, B, answer.slope, W, _best_control_of_fit(problem, W / 2, b - apply(W, about))
 
-    about = problem.rest_at(now)
-    led, B, slope, W, best = responses(about)
-    for _ in range(NEWTON_STEPS if about_best else 0):
-        about = best
+    if problem.system.affine:
+        about = problem.rest_at(now)
         led, B, slope, W, best = responses(about)
+        for _ in range(NEWTON_STEPS if about_best else 0):
+            about = best
+            led, B, slope, W, best = responses(about)
+    else:
+        free = problem.response(now)
+        _, steep, bend = penalty_of_one_step(problem, free.x)
+        V_x, H = gradient[1:] + apply(H, free.x - x[1:]) + steep, H + bend
+        about = best = held_control(problem, now, free, V_x, H)
+        values, vectors = torch.linalg.eigh(derivatives_of(step_objective(problem, now, free, V_x, H), best)[1])
+        W, answer = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT, problem.response(now, best)
+        B, slope, led = answer.by_control, answer.slope, answer.x
+        if not about_best:  # the law evaluates V where the nominal control leads
+            slope, led = slope + apply(B.mT, apply(H, led - free.x)), free.x
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _error_scale(problem, optimum)
     rate = cost / problem.horizon.duration
     if problem.horizon.stationary:

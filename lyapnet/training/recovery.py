@@ -116,7 +116,7 @@ def infinite_slope(member: Learner) -> str | None:
         return None
     parts = type(problem.system).__name__, type(as_written(problem.cost)).__name__
     for name, function in (
-        (f"{parts[0]}.f(x)", problem.system.f), (f"{parts[0]}.g(x)", problem.system.g),
+        *((f"{parts[0]}.{name}", function) for name, function in problem.functions_of_state.items()),
         (f"q(x) of {parts[1]}", problem.cost.state), (f"φ(x) of {parts[1]}", problem.cost.terminal),
     ):  # fmt: skip
         if (found := without_slope(function, [x])) is not None:

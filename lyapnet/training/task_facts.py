@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.base.contracts import SLOPE, jumps
 from lyapnet.base.random_streams import OUTPUTS as OUTPUTS_STREAM
@@ -30,7 +30,8 @@ from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.training.start import NOT_FINITE_REMEDY, STEP_ERROR_REMEDY, TRIAL_STATES
 from lyapnet.training.start_cache import load_or_choose_start
-from lyapnet.value.expansions import in_float64, path_under
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import derivatives_of, in_float64, path_under
 from lyapnet.value.linearisation import (
     NAME_A_GOAL,
     LinAlgError,
@@ -49,6 +50,8 @@ REACHABILITY_TOLERANCE = 1e-10  # relative to A in scaled units: larger entries 
 EIGENVALUE_TOLERANCE = 1e-8  # relative to the largest eigenvalue or A: smaller real and imaginary parts count as zero
 OBSERVED_LOOPS = 16  # closed loops along which it is tested whether outputs tell the state
 VAGUE = 0.5  # share of the uncertainty of x₀ that is left at T, above which the outputs do not tell a state
+CONVEX = "convex"  # name of a fact
+CONVEXITY_LOOPS, CONVEXITY_NODES, CONVEXITY_CONTROLS = 64, 8, 32  # loops, nodes of each and controls that are tried
 DOMAIN_TEST_STATES = 64  # states of X₀ whose closed loops are checked against the domain
 ROUNDING_UNITS = 100  # rounding error of a rate that sums several terms, in units of the machine precision
 
@@ -106,7 +109,12 @@ def facts_of(
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))
         return facts
-    tell(*_start_facts(start), *_domain_facts(learner), *observability_facts(learner, outputs))
+    tell(
+        *_start_facts(start),
+        *_domain_facts(learner),
+        *convexity_facts(problem, learner.V, learner.rollout.closed_loop.policy),
+    )
+    tell(*observability_facts(learner, outputs))
     return facts
 
 
@@ -159,6 +167,51 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     ]
 
 
+@torch.no_grad()
+def convexity_facts(problem: Problem, V: ValueFunction, law: nn.Module) -> list[Fact]:
+    """At which share of states along loops of the start ℓ + V_xᵀF(x, u) is not convex in u, if F is not affine in u.
+
+    Controls are drawn from U; without limits from a range three times as wide as that of the loops.
+    """
+    system = problem.system
+    if system.affine:
+        return []
+    x0, times = problem.initial_states.sample(CONVEXITY_LOOPS, stream(0, START)), problem.horizon.times(problem.goal)
+    path = path_under(problem, lambda n, x: law(times[n], x), x0)
+    nodes = torch.linspace(0, problem.horizon.steps - 1, CONVEXITY_NODES).long()
+    rows = path.cost.isfinite()
+    if not rows.any():
+        return [Fact(CONVEX, "unknown: no closed loop of the start is finite")]
+    x, t = path.x[nodes][:, rows], times[nodes][:, None].expand(-1, int(rows.sum()))
+    assert problem.controls.limits is not None  # the problem refuses other sets
+    used = path.u[:, rows].flatten(0, 1)
+    wide = used.amax(0) - used.amin(0)
+    ends = (used.amin(0) - wide, used.amax(0) + wide)
+    low, high = (
+        torch.where(side.isfinite(), side.to(x), end) for side, end in zip(problem.controls.limits, ends, strict=True)
+    )
+    share = torch.rand(CONVEXITY_CONTROLS, 1, 1, system.m, generator=stream(0, START)).to(x)
+    u = (low + share * (high - low)).expand(-1, *x.shape[:-1], -1)
+    V_x = V.value_and_state_gradient(t, x)[1]
+
+    def hamiltonian(u: Tensor) -> Tensor:
+        here = x.expand(*u.shape[:-1], -1)
+        return problem.cost.smooth_running(here, u) + (V_x * system.dynamics(here, u)).sum(-1)
+
+    curvature = derivatives_of(hamiltonian, u)[1].double()
+    least = torch.linalg.eigvalsh(curvature.nan_to_num(0, 0, 0))[..., 0]
+    bent = (least < -ROUNDING_UNITS * torch.finfo(x.dtype).eps * curvature.abs().amax((-2, -1))).any(0)
+    tried = f"{bent.numel()} states along closed loops of the start, at {CONVEXITY_CONTROLS} controls each"
+    if not bent.any():
+        return [Fact(CONVEX, f"ℓ + V_xᵀF(x, u) is convex in u at {tried}")]
+    k = int(torch.where(bent, least.amin(0), torch.inf).argmin())
+    worst = int(least.flatten(1)[:, k].argmin())
+    place = f"t = {float(t.flatten()[k]):.3g} s, x = {_format_vector(x.flatten(0, 1)[k])}"
+    found = f"ℓ + V_xᵀF(x, u) is not convex in u at {float(bent.double().mean()):.0%} of {tried}: as at {place}, "
+    found += f"u = {_format_vector(u.flatten(1, 2)[worst, k])}"
+    return [Fact(CONVEX, f"{found}; the law looks for its minimum from several starts")]
+
+
 def _domain_facts(learner: Learner) -> Iterator[Fact]:
     """From how many states of X₀ closed loops leave the domain, and which constraints prevent it."""
     domain = learner.problem.domain
@@ -186,7 +239,7 @@ def jump_facts(problem: Problem) -> list[Fact]:
         return [
             Fact("jumps", jump.told(name, problem.system.state_names), SLOPE)
             for name, function in (
-                (f"{system}.f(x)", problem.system.f), (f"{system}.g(x)", problem.system.g),
+                *((f"{system}.{name}", function) for name, function in problem.functions_of_state.items()),
                 (f"q(x) of {written}", cost.state), (f"φ(x) of {written}", cost.terminal),
             )
             for jump in jumps(function, low - room, high + room)
@@ -353,7 +406,7 @@ def step_gain(problem: Problem, rollout: Rollout | None = None) -> Fact:
     at_goal = riccati_or_reason(problem)
     if isinstance(at_goal, Missing):
         return Fact(STEP_GAIN, f"unknown: {at_goal.reason}; {at_goal.remedy}")
-    g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
+    g, R = problem.system.affine_model(problem.goal, problem.rest)[1].detach(), problem.cost.R(problem.goal)
     weighted = torch.linalg.solve(R, g.mT @ at_goal.hessian @ g)
     if not weighted.isfinite().all():
         return Fact(STEP_GAIN, "unknown: R⁻¹gᵀV_xx g is not finite at the goal; give every control a weight in R")

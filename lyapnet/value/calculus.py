@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, Noise, PerState, State, Time, Value
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
 class ValueFunction(nn.Module, ABC):
@@ -53,17 +53,17 @@ def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
     return V_t, V_x
 
 
-def drift_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> PerState:
+def drift_lie_derivative(system: ControlSystem, x: State, V_x: State) -> PerState:
     """LfV = V_xᵀf(x)."""
     return (V_x * system.f(x)).sum(-1)
 
 
-def input_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> Control:
+def input_lie_derivative(system: ControlSystem, x: State, V_x: State) -> Control:
     """LgV = g(x)ᵀV_x."""
     return apply(system.g(x).mT, V_x)
 
 
-def time_derivative(V: ValueFunction, system: ControlAffineSystem, t: Time, x: State, u: Control) -> PerState:
+def time_derivative(V: ValueFunction, system: ControlSystem, t: Time, x: State, u: Control) -> PerState:
     """V̇ = V_t + V_xᵀ(f(x) + g(x)u), with the same V_x as in control laws, so that interval bounds see terms cancel."""
     V_t, V_x = gradients(V, t, x)[0], V.value_and_state_gradient(t, x)[1]
     return V_t + (V_x * system.dynamics(x, u)).sum(-1)

@@ -51,7 +51,7 @@ def linearised(problem: Problem) -> Linearisation:
     with torch.enable_grad():
         x = problem.goal.clone().requires_grad_()
         A = jacobian(problem.system.dynamics(x, problem.rest), x).detach()
-    f, g = problem.system.f(problem.goal).detach(), problem.system.g(problem.goal).detach()
+    f, g = (part.detach() for part in problem.system.affine_model(problem.goal, problem.rest))
     values = _missing_values(problem, f, g)
     return Linearisation(f, g, A, values, values or _missing_slope(problem, A))
 

@@ -13,10 +13,10 @@ from lyapnet.task.cost import Cost
 from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.problem import Problem, Response
 from lyapnet.task.sets import ControlSet, about_control
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.value.derivatives import jacobian
-from lyapnet.value.expansions import held_control, riccati
+from lyapnet.value.expansions import held_control, minimise_over_controls, riccati
 from lyapnet.value.risk import equivalent_derivatives
 
 DESCENTS = 3  # Newton steps of the lookahead law
@@ -46,7 +46,7 @@ class ValuePolicy(nn.Module):
     held: bool = False  # whether u is made to be held for Δt from t on
     origin: str = ""  # where V and u come from, if they were imported
     precision: str | None = None  # floating-point format of u for proofs that include its rounding; None: real numbers
-    system: ControlAffineSystem
+    system: ControlSystem
     cost: Cost
     controls: ControlSet
     V: ValueFunction
@@ -65,7 +65,15 @@ class ValuePolicy(nn.Module):
 
 
 class HJBPolicy(ValuePolicy):
-    """u*(t, x) = argmin over u ∈ U of ℓ(x, u) + V_xᵀ(f + gu); with U = ℝᵐ it is −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+    """u*(t, x) = argmin over u ∈ U of ℓ(x, u) + V_xᵀ(f + gu); with U = ℝᵐ it is −½ R(x)⁻¹ g(x)ᵀ V_x(t, x).
+
+    Raises:
+        UsageError: the system is not control-affine.
+    """
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        _require_affine(problem, "hjb")
+        super().__init__(problem, V)
 
     def forward(self, t: Time, x: State) -> Control:
         return self._minimise(x, self.V.value_and_state_gradient(t, x)[1])
@@ -96,6 +104,15 @@ class HJBPolicy(ValuePolicy):
         return LeastCost(minimum.u, b, minimum.value if rest is None else minimum.value + quadratic_form(R, rest))
 
 
+def _require_affine(problem: Problem, law: str) -> None:
+    """Refuse a system that is not control-affine, for a law that is a formula of f and g."""
+    if not problem.system.affine:
+        raise UsageError(
+            f"Expected a control-affine system for the law {law}, got {problem.system.title}, which is not; take "
+            "sampled or lookahead."
+        )
+
+
 class SontagPolicy(ValuePolicy):
     """Sontag's universal formula, weighted by the cost: with a = V_t + LfV, b = LgV and σ = bᵀR⁻¹b,
 
@@ -116,6 +133,7 @@ class SontagPolicy(ValuePolicy):
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
+        _require_affine(problem, "sontag")
         if problem.controls.limited:
             raise ValueError(
                 f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
@@ -182,7 +200,7 @@ class SampledPolicy(ValuePolicy):
         if self.problem.risk and self.problem.noise is not None:
             sigma, dt = self.problem.noise(x), self.problem.horizon.dt
             V_x, H = equivalent_derivatives(V_x, H, sigma, dt, self.problem.risk)
-        return held_control(self.problem, free, V_x, H)
+        return held_control(self.problem, x, free, V_x, H)
 
     def _after(self, t: Time) -> Time:
         """t + Δt, at most T."""
@@ -213,6 +231,10 @@ class LookaheadPolicy(SampledPolicy):
     """
 
     def forward(self, t: Time, x: State) -> Control:
+        if not self.problem.system.affine:
+            with torch.no_grad():
+                start = super().forward(t, x)
+            return self._minimise(self._after(t), x, start)
         step = _HeldStep(self.problem, self.V, self._after(t), x)
         H = self._curvature(step.after, x)
         with torch.no_grad():
@@ -223,6 +245,16 @@ class LookaheadPolicy(SampledPolicy):
             return u
         moved = step.newton(u, H)
         return u + (moved - moved.detach())
+
+    def _minimise(self, after: Time, x: State, start: Control) -> Control:
+        """argmin over u ∈ U of ∫ℓ + V(t + Δt, F(x, u)) of a system that is not affine, from the sampled law."""
+        problem, dt = self.problem, self.problem.horizon.dt
+
+        def Q(u: Control) -> PerState:
+            rate, cost = problem.smooth_rates(x.expand(*u.shape[:-1], -1), u)
+            return cost + self.V(after, x + dt * rate) / dt
+
+        return minimise_over_controls(problem, Q, start[None], 2 * problem.cost.R(x))
 
 
 class _HeldStep:
@@ -293,7 +325,7 @@ def gain_over_step(problem: Problem, V: ValueFunction) -> float:
     for t in (times[0], times[len(times) // 2], times[-2]):
         with torch.enable_grad():
             z = x.detach().requires_grad_()
-            g = problem.system.g(x)
+            g = problem.system.affine_model(x, problem.nominal_at(x))[1]
             bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1].to(g)), z).detach()
         weighted = torch.linalg.solve(problem.cost.R(x).to(bent), multiply(bent, g.to(bent))).nan_to_num()
         greatest = max(greatest, problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max()))

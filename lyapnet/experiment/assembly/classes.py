@@ -19,7 +19,7 @@ from lyapnet.task.constraints import CONSTRAINTS, Constraints
 from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import COSTS, Cost
 from lyapnet.task.sets import ControlSet
-from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+from lyapnet.task.systems import SYSTEMS, ControlSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import NETWORKS
 
@@ -30,7 +30,7 @@ DTYPES = {"float64": torch.float64, "float32": torch.float32}
 class Parts:
     """The user's objects, which replace those named in a config; None: as in the config."""
 
-    system: ControlAffineSystem | None = None
+    system: ControlSystem | None = None
     cost: Cost | None = None
     controls: ControlSet | None = None
     constraints: Constraints | None = None
@@ -40,7 +40,7 @@ class Parts:
 
 # section of a config ↦ (registered classes, base class of users' classes)
 REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
-    "system": (SYSTEMS, ControlAffineSystem),
+    "system": (SYSTEMS, ControlSystem),
     "cost": (COSTS, Cost),
     "controls": (CONTROL_SETS, ControlSet),
     "constraints": (CONSTRAINTS, Constraints),

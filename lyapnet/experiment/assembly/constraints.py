@@ -13,7 +13,7 @@ from lyapnet.task.constraints import CONSTRAINTS, AllOf, Ball, Constraints, OfFi
 from lyapnet.task.domain import size_of
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.derivatives import jacobian
 
 SMALL_MARGIN = 0.002  # margin of h if u acts on h directly (relative degree one)
@@ -59,7 +59,7 @@ def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
     with torch.enable_grad():
         x.requires_grad_()
         slopes = jacobian(constraints(x), x)
-    g = problem.system.g(x)
+    g = problem.system.affine_model(x, problem.nominal_at(x))[1]
     moved, most = (slopes @ g).abs().amax(-1), (slopes.abs() @ g.abs()).amax(-1)
     at_once = (moved > ROUNDING * most).double().mean(0) > 0.5
     return [SMALL_MARGIN if each else LARGE_MARGIN for each in at_once.tolist()]
@@ -80,7 +80,7 @@ def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:
     return [StateLimits(*zip(*columns, strict=True))] if columns else []
 
 
-def _balls(config: ConstraintsConfig, system: ControlAffineSystem) -> list[Constraints]:
+def _balls(config: ConstraintsConfig, system: ControlSystem) -> list[Constraints]:
     balls: list[Constraints] = []
     for key in ("outside", "inside"):
         for k, given in enumerate(getattr(config, key)):
@@ -92,7 +92,7 @@ def _balls(config: ConstraintsConfig, system: ControlAffineSystem) -> list[Const
 
 
 def ball_of(
-    given: Mapping[str, Any], key: str, keys: set[str], system: ControlAffineSystem
+    given: Mapping[str, Any], key: str, keys: set[str], system: ControlSystem
 ) -> tuple[dict[str, float], float]:
     """The centre, by names of states, and the radius of an entry with given keys.
 

@@ -7,7 +7,7 @@ import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.experiment.schema import joined
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 Value = TypeVar("Value")
 
@@ -21,7 +21,7 @@ def rows(name: str, matrix: Any) -> Any:
     return matrix
 
 
-def entry_per_state(key: str, entries: list[float] | None, system: ControlAffineSystem) -> list[float] | None:
+def entry_per_state(key: str, entries: list[float] | None, system: ControlSystem) -> list[float] | None:
     """A list with one entry for each state, from such a list or a single number; None if there is none.
 
     Raises:
@@ -47,7 +47,7 @@ def require_length(key: str, length: int, names: Sequence[str]) -> None:
         raise UsageError(f"Expected {key} with {entries} ({', '.join(names)}), got {length}; give one for each.")
 
 
-def index_of(name: str, key: str, system: ControlAffineSystem) -> int:
+def index_of(name: str, key: str, system: ControlSystem) -> int:
     """The index of the state with a name, in which _ stands for a space too.
 
     Raises:
@@ -66,7 +66,7 @@ def index_among(name: str, key: str, names: Sequence[str], advice: str = "name s
 
 
 def by_state(
-    given: Mapping[str, Value], key: str, system: ControlAffineSystem, advice: str = "name states of the system."
+    given: Mapping[str, Value], key: str, system: ControlSystem, advice: str = "name states of the system."
 ) -> dict[int, Value]:
     """Index ↦ value of entries by names of states.
 

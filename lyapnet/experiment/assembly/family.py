@@ -19,7 +19,7 @@ from lyapnet.task.cost import Cost, MadeOfAnother, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 RESERVED_NAMES = ("t", "x", "x0", "steps")  # other arguments of a controller's methods
 TEST_STATES = 8  # random (x, p) at which members are compared with newly constructed systems
@@ -27,7 +27,7 @@ TEST_STATES = 8  # random (x, p) at which members are compared with newly constr
 
 def family_of(
     config: Config,
-    system: ControlAffineSystem,
+    system: ControlSystem,
     cost: Cost,
     controls: ControlSet,
     initial_states: Box,
@@ -68,7 +68,7 @@ def family_of(
 
 def members_of(
     config: Config,
-    system: ControlAffineSystem,
+    system: ControlSystem,
     ranges: Mapping[str, Sequence[float]],
     units: Sequence[str],
     initial_states: Box,
@@ -156,7 +156,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
     return dict(ranges)
 
 
-def _moved_states(names: Collection[str], system: ControlAffineSystem) -> dict[int, int]:
+def _moved_states(names: Collection[str], system: ControlSystem) -> dict[int, int]:
     """Index of a state ↦ index of the parameter target_STATE that is its target."""
     known = {PREFIX + joined(name): i for i, name in enumerate(system.state_names)}
     moved = dict[int, int]()
@@ -176,7 +176,7 @@ def _check_members(config: Config, family: FamilySystem, box: Box, key: str) -> 
         return
     cls, given = type(family.system), config.system.parameters
 
-    def build(values: Mapping[str, float]) -> ControlAffineSystem:
+    def build(values: Mapping[str, float]) -> ControlSystem:
         with section(key.removeprefix("a ")):
             return cls(**{**given, **values})
 

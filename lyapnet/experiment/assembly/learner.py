@@ -15,7 +15,7 @@ from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import Cost, MadeOfAnother, RegulatorsTail
 from lyapnet.task.family import FamilySystem, family_cost_of
 from lyapnet.task.problem import Problem
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import (
     CentredNetwork,
@@ -171,7 +171,7 @@ def program_options(config: Config) -> dict[str, Any]:
     return {key: value for key, value in given.items() if key not in ("name", "parameters") and value is not None}
 
 
-def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
+def _kept_states(config: Config, system: ControlSystem) -> list[int]:
     """The indices of the states on which V depends."""
     ignored = {index_of(name, "network.ignored_states", system) for name in config.network.ignored_states}
     if len(ignored) == system.n:

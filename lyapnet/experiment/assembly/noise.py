@@ -7,10 +7,10 @@ from lyapnet.experiment.config import Config
 from lyapnet.loop.rollout.expectations import MOST_SOURCES
 from lyapnet.task.noise import Noise, StateNoise
 from lyapnet.task.problem import Problem
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 
-def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
+def build_noise(config: Config, system: ControlSystem) -> Noise | None:
     """The noise of a config; None if it lists none, and the system's own applies.
 
     Raises:

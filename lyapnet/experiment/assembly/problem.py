@@ -40,7 +40,7 @@ from lyapnet.task.cost import (
 from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box, ControlBox, ControlSet
-from lyapnet.task.systems import ControlAffineSystem, Linear
+from lyapnet.task.systems import ControlSystem, Linear
 
 
 def build_problem(config: Config, parts: Parts | None = None) -> Problem:
@@ -112,7 +112,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         return problem.to(dtype)
 
 
-def operating_point(config: Config, parts: Parts | None = None) -> tuple[ControlAffineSystem, Trim]:
+def operating_point(config: Config, parts: Parts | None = None) -> tuple[ControlSystem, Trim]:
     """The system of a config and the operating point of its target; cost and horizon are not needed.
 
     Raises:
@@ -131,7 +131,7 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
         return system, trim(config, system, controls, initial_states)
 
 
-def _checked_states(system: ControlAffineSystem, initial_states: Box) -> State:
+def _checked_states(system: ControlSystem, initial_states: Box) -> State:
     """States of X₀ at which f, g and ẋ have the right shapes; a UsageError where they do not."""
     x = initial_states.sample(TRIED, torch.Generator().manual_seed(0))
     check_shapes_of_system(copied(system), x)
@@ -148,7 +148,7 @@ def _cost_section(config: Config) -> CostConfig:
 
 
 def _refuse_free_controls(
-    config: Config, system: ControlAffineSystem, controls: ControlSet | None, initial_states: Box, horizon: Horizon
+    config: Config, system: ControlSystem, controls: ControlSet | None, initial_states: Box, horizon: Horizon
 ) -> None:
     """Refuse a quadratic cost whose R has no weight for a limited control; other errors are reported later."""
     try:
@@ -174,18 +174,18 @@ def _refuse_free_controls_of_own_cost(problem: Problem) -> None:
         refuse_free_controls(problem, R)
 
 
-def build_system(config: SystemConfig) -> ControlAffineSystem:
+def build_system(config: SystemConfig) -> ControlSystem:
     """The system of a config, registered or the user's own."""
     return instance_of(config, "system")
 
 
-def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:
+def with_parameters(system: ControlSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlSystem:
     """A system of the same class with other arguments, in the precision and on the device of a tensor."""
     with float64_defaults():
         return type(system)(**parameters).to(like)
 
 
-def build_initial_states(config: InitialStatesConfig, system: ControlAffineSystem) -> Box:
+def build_initial_states(config: InitialStatesConfig, system: ControlSystem) -> Box:
     """X₀ of a config; a single number is a bound for every state."""
     with section("initial_states"):
         bounds = {side: repeated(getattr(config, side), system.n) for side in ("lower", "upper")}
@@ -194,7 +194,7 @@ def build_initial_states(config: InitialStatesConfig, system: ControlAffineSyste
         return Box(**bounds)
 
 
-def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
+def build_cost(config: CostConfig, system: ControlSystem | None = None) -> Cost:
     """The cost of a config; the shapes of a quadratic one are checked against the system."""
     if config.name not in COSTS:
         if config.periodic:
@@ -239,7 +239,7 @@ def _with_control_costs(config: Config, cost: Cost, controls: ControlSet, m: int
     return controls
 
 
-def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
+def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlSystem) -> Cost:
     """Make a cost periodic in some angles, in which it has to be even."""
     angles = [index_of(name, "cost.periodic", system) for name in names]
     for weight in (cost.Q, cost.Q_T):
@@ -249,7 +249,7 @@ def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlAff
     return PeriodicCost(cost, angles, system.n)
 
 
-def _with_time(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
+def _with_time(config: CostConfig, cost: Cost, system: ControlSystem) -> Cost:
     """The cost with the cost of time of a config."""
     if config.time is None:
         if config.within:
@@ -261,7 +261,7 @@ def _with_time(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> C
     return TimeCost(cost, near, config.time, system.n)
 
 
-def _nearness(config: CostConfig, system: ControlAffineSystem) -> Tensor:
+def _nearness(config: CostConfig, system: ControlSystem) -> Tensor:
     """Q (n, n) with xᵀQx = ½ Σ_i (x_i/w_i)², of the distances w_i of cost.within."""
     widths = by_state(config.within, "cost.within", system)
     if not widths or not all(type(width) in (int, float) and 0 < width < math.inf for width in widths.values()):
@@ -275,7 +275,7 @@ def _nearness(config: CostConfig, system: ControlAffineSystem) -> Tensor:
     return Q
 
 
-def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
+def _with_obstacles(config: CostConfig, cost: Cost, system: ControlSystem) -> Cost:
     """The cost with the obstacles of a config."""
     for k, given in enumerate(config.obstacles):
         center, radius = ball_of(given, "cost.obstacles", {"center", "radius", "weight"}, system)
@@ -285,7 +285,7 @@ def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem)
     return cost
 
 
-def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
+def _control_weight(R: Any, system: ControlSystem) -> Any:
     """R as a matrix, or the function inverse_mass of the state."""
     if not isinstance(R, str):
         R = rows("R", repeated(R, system.m))
@@ -302,7 +302,7 @@ def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
     return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
 
 
-def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> ControlSet:
+def build_controls(config: ControlsConfig, system: ControlSystem) -> ControlSet:
     """The control set of a config: a box if it has limits, else a registered set or the user's own."""
     if config.lower is None and config.upper is None:
         return instance_of(config, "controls")
@@ -319,7 +319,7 @@ def refuse_two_sets(config: ControlsConfig) -> None:
         raise UsageError(f"Expected limits or a controls.name, got both ({config.name}); leave one of them out.")
 
 
-def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> list[float]:
+def _limits(key: str, given: Any, none: float, system: ControlSystem) -> list[float]:
     """A limit for each control, from a single number or a list; null means no limit."""
     entries = [none if entry is None else entry for entry in (given if isinstance(given, list) else [given])]
     if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):

@@ -17,7 +17,7 @@ from lyapnet.task.family import FamilyCost, InterpolatedTargets
 from lyapnet.task.problem import TRIED
 from lyapnet.task.reference import TimedSystem
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.derivatives import jacobian_of
 
 COUNTS = (9, 17, 33, 65, 129)  # numbers of functions that r is a sum of; the first is taken that is accurate
@@ -31,7 +31,7 @@ ADVICE = "give columns for other states, or say what the cost counts u from, as 
 
 
 def reference_of(
-    config: Config, system: ControlAffineSystem, cost: Cost, controls: ControlSet, initial_states: Box
+    config: Config, system: ControlSystem, cost: Cost, controls: ControlSet, initial_states: Box
 ) -> tuple[TimedSystem, FamilyCost, Box]:
     """The system in z = (x, τ), the cost of x − r(τ) and u − u_r(τ), and the box X₀ × times.
 
@@ -41,6 +41,10 @@ def reference_of(
         UsageError: names, times or numbers do not fit, or no control follows r.
     """
     reference = config.reference
+    if not system.affine:
+        raise UsageError(
+            f"Expected a control-affine system for a reference, got {system.title}; take a target for each goal."
+        )
     if config.target is not None or config.target_control is not None or config.family or config.horizon.stationary:
         raise UsageError(
             "Expected a reference without target, target_control, family and horizon.stationary, got one of them; "
@@ -95,7 +99,7 @@ class _Curve:
         return jacobian_of(self.at, tau, self.coefficients.shape[-1])[..., 0]
 
 
-def _points_of(config: Config, system: ControlAffineSystem) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+def _points_of(config: Config, system: ControlSystem) -> tuple[np.ndarray, dict[int, np.ndarray]]:
     """The times of the reference's points (K,), and index ↦ values (K,) of the states that are given.
 
     Raises:
@@ -144,7 +148,7 @@ def _points_of(config: Config, system: ControlAffineSystem) -> tuple[np.ndarray,
 def _fit(
     times: np.ndarray,
     values: Mapping[int, np.ndarray],
-    system: ControlAffineSystem,
+    system: ControlSystem,
     initial_states: Box,
     periodic: bool,
 ) -> tuple[_Curve, _Curve, Tensor]:
@@ -192,7 +196,7 @@ def _fit(
     return best
 
 
-def _rates_of(system: ControlAffineSystem, initial_states: Box, given: Mapping[int, np.ndarray]) -> dict[int, int]:
+def _rates_of(system: ControlSystem, initial_states: Box, given: Mapping[int, np.ndarray]) -> dict[int, int]:
     """Index of a state that is not given ↦ that of the given one whose rate it is, such as velocity ↦ position."""
     x = initial_states.sample(TRIED, torch.Generator().manual_seed(0)).double()
     x = x + torch.rand(x.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)  # fixed states too
@@ -205,7 +209,7 @@ def _rates_of(system: ControlAffineSystem, initial_states: Box, given: Mapping[i
     }
 
 
-def _following_control(system: ControlAffineSystem, path: _Curve, tau: Tensor) -> Tensor:
+def _following_control(system: ControlSystem, path: _Curve, tau: Tensor) -> Tensor:
     """u with f(r) + g(r)u = ṙ, as the least squares solution of least norm, (b, m)."""
     r = path.at(tau)
     return apply(torch.linalg.pinv(system.g(r)), path.rate(tau) - system.f(r))
@@ -216,7 +220,7 @@ def _between(times: np.ndarray) -> Tensor:
     return torch.linspace(0, float(times[-1]), BETWEEN * len(times) + 1, dtype=torch.float64)[:, None]
 
 
-def _rates_left(system: ControlAffineSystem, path: _Curve, control: _Curve, tau: Tensor) -> Tensor:
+def _rates_left(system: ControlSystem, path: _Curve, control: _Curve, tau: Tensor) -> Tensor:
     """max |f(r) + g(r)u_r − ṙ| of each state, relative to the largest |ṙ|, |f(r)| and |g(r)u_r|, (n,)."""
     r, rate = path.at(tau), path.rate(tau)
     f, pushed = system.f(r).expand_as(r), apply(system.g(r), control.at(tau))
@@ -224,7 +228,7 @@ def _rates_left(system: ControlAffineSystem, path: _Curve, control: _Curve, tau:
     return (f + pushed - rate).abs().amax(0) / torch.where(scale > 0, scale, 1.0)
 
 
-def _require_followed(system: ControlAffineSystem, left: Tensor) -> None:
+def _require_followed(system: ControlSystem, left: Tensor) -> None:
     worst = int(left.argmax())
     if not float(left[worst]) <= FOLLOWED:
         raise UsageError(
@@ -233,7 +237,7 @@ def _require_followed(system: ControlAffineSystem, left: Tensor) -> None:
         )
 
 
-def _tell_limits(system: ControlAffineSystem, controls: ControlSet, u: Tensor) -> None:
+def _tell_limits(system: ControlSystem, controls: ControlSet, u: Tensor) -> None:
     """Say in a note which of the controls u (k, m) along the reference are beyond their limits."""
     beyond = (controls.project(u) - u).abs().amax(0) > 0
     if bool(beyond.any()):

@@ -27,6 +27,8 @@ def without_end(problem: Problem) -> Problem:
             no regulator stabilises it; of a family, of any member.
     """
     system, limits = problem.system, problem.controls.limits
+    if not system.affine:
+        raise UsageError(f"Expected a control-affine system for {PURPOSE}, got {system.title}; take stationary: false.")
     if limits is None:
         raise UsageError(
             f"Expected controls without limits, or a set that tells its `limits`, for {PURPOSE}, got "

@@ -16,7 +16,7 @@ from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import Cost, TargetCost
 from lyapnet.task.operating_points import OperatingPoint, OperatingPoints
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 LISTED_POINTS = 4  # largest number of further operating points in a note
 CONTROL_ADVICE = "say what the cost counts u from, as in target_control: [0]"
@@ -30,9 +30,7 @@ class Trim(NamedTuple):
     note: str  # how it was found; empty if the given target is held exactly
 
 
-def about_target(
-    config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet, initial_states: Box
-) -> Cost:
+def about_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet, initial_states: Box) -> Cost:
     """The cost with the target of a config, if there is one; a note reports components that were solved for."""
     if config.target_control is not None:
         return about_written_target(config, cost, system, controls)
@@ -43,7 +41,7 @@ def about_target(
     return TargetCost(cost, x, u)
 
 
-def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
+def about_written_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet) -> Cost:
     """The cost with exactly the given x* and u*."""
     if config.target is None:
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")
@@ -53,7 +51,7 @@ def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem
     return TargetCost(cost, x, u)
 
 
-def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, initial_states: Box) -> Trim:
+def trim(config: Config, system: ControlSystem, controls: ControlSet, initial_states: Box) -> Trim:
     """The operating point of a config's target, f(x*) + g(x*)u* = 0, solved for all components that are not given.
 
     Raises:
@@ -88,7 +86,7 @@ def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, init
     return Trim(_require_admitted(search, point), others, f"target: {note}.")
 
 
-def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
+def named_entries(target: Any, system: ControlSystem) -> dict[int, float]:
     """Index ↦ value of a target that is a list for all states, a number for every state, or a mapping by name.
 
     Raises:
@@ -119,7 +117,7 @@ def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
     return found
 
 
-def _written_target(config: Config, system: ControlAffineSystem) -> Tensor:
+def _written_target(config: Config, system: ControlSystem) -> Tensor:
     """The target of a config, which has to give every state.
 
     Raises:
@@ -134,7 +132,7 @@ def _written_target(config: Config, system: ControlAffineSystem) -> Tensor:
     return torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64)
 
 
-def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:
+def _written_control(config: Config, system: ControlSystem) -> Tensor:
     given = repeated(config.target_control, system.m)
     require_length("target_control", len(given), system.control_names)
     if not all(math.isfinite(number) for number in given):
@@ -162,7 +160,7 @@ def _move_to_nearest(
     raise not_held_error(system, point.x, advice)
 
 
-def not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
+def not_held_error(system: ControlSystem, x: Tensor, advice: str) -> UsageError:
     """The error for a target that no control holds."""
     left = system.holding_control(x)[1]
     worst = int(left.abs().nan_to_num(torch.inf).argmax())
@@ -178,7 +176,7 @@ def _require_admitted(search: OperatingPoints, point: OperatingPoint) -> Operati
     return point
 
 
-def _not_admitted_error(system: ControlAffineSystem, controls: ControlSet, u: Tensor) -> UsageError:
+def _not_admitted_error(system: ControlSystem, controls: ControlSet, u: Tensor) -> UsageError:
     got = [f"{label} = {value:.4g}" for label, value in zip(system.control_labels, u.tolist(), strict=True)]
     if controls.limits is not None:
         low, high = (side.expand(system.m).tolist() for side in controls.limits)
@@ -189,7 +187,7 @@ def _not_admitted_error(system: ControlAffineSystem, controls: ControlSet, u: Te
     )
 
 
-def state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
+def state_limits(config: ConstraintsConfig, system: ControlSystem) -> tuple[Tensor, Tensor]:
     """The state limits of a config, within which points are preferred; their names are checked elsewhere."""
     low, high = (
         torch.tensor([float(named.get(joined(name), none)) for name in system.state_names], dtype=torch.float64)
@@ -199,11 +197,11 @@ def state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tupl
     return low, high
 
 
-def _format_entries(given: Mapping[int, float], system: ControlAffineSystem) -> str:
+def _format_entries(given: Mapping[int, float], system: ControlSystem) -> str:
     return ", ".join(f"{system.state_names[i]} = {number:.9g}" for i, number in given.items())
 
 
-def _format_point(point: OperatingPoint, system: ControlAffineSystem, given: Mapping[int, float] | None = None) -> str:
+def _format_point(point: OperatingPoint, system: ControlSystem, given: Mapping[int, float] | None = None) -> str:
     """Format the solved components in nine digits: "current = 0.454124583, held by duty = 0.339388328"."""
     states = {i: float(point.x[i]) for i in range(system.n) if given is None or i not in given}
     controls = [f"{name} = {u:.9g}" for name, u in zip(system.control_names, point.u.tolist(), strict=True)]

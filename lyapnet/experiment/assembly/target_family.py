@@ -194,7 +194,9 @@ class TargetsOfMembers:
         for p in tested:
             search, x = self._search(p), middle.x + targets.shift(p)
             missed = [abs(float(x[i]) - value) > ACCURATE * (1 + abs(value)) for i, value in self.given(p).items()]
-            rate = (search.system.f(x) + search.system.g(x) @ targets.rest(p)) / search.rate
+            u = targets.rest(p)
+            f, g = search.system.affine_model(x, u)
+            rate = (f + g @ u) / search.rate
             if any(missed) or not bool((rate.abs() <= ACCURATE).all()):
                 return False
         return True

@@ -11,7 +11,7 @@ from lyapnet.experiment.assembly.entries import repeated, rows
 from lyapnet.experiment.config import CostConfig
 from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import COSTS, MATRICES, Cost, DiagonalWeights, MadeOfAnother, QuadraticCost
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 
 PREFIXES = ("cost.", *(f"{matrix}_" for matrix in MATRICES))  # of names that are weights, or numbers of the system
 
@@ -23,7 +23,7 @@ class Weight(NamedTuple):
     i: int
 
 
-def named(parameters: Mapping[str, Any], system: ControlAffineSystem) -> dict[str, Any]:
+def named(parameters: Mapping[str, Any], system: ControlSystem) -> dict[str, Any]:
     """Parameters of a family with each weight under one name, as R_torque for cost.R.0 and cost.R.torque.
 
     Raises:
@@ -36,7 +36,7 @@ def named(parameters: Mapping[str, Any], system: ControlAffineSystem) -> dict[st
     return found
 
 
-def weights_among(names: Iterable[str], system: ControlAffineSystem) -> dict[str, Weight]:
+def weights_among(names: Iterable[str], system: ControlSystem) -> dict[str, Weight]:
     """The weights of the cost among names that a config gives for a family, by the one name of each.
 
     Raises:
@@ -50,7 +50,7 @@ def weights_among(names: Iterable[str], system: ControlAffineSystem) -> dict[str
     return {spellings[name]: weights[spellings[name]] for name in names if name in spellings}
 
 
-def weights_of(system: ControlAffineSystem) -> dict[str, Weight]:
+def weights_of(system: ControlSystem) -> dict[str, Weight]:
     """The weights of a quadratic cost by name: Q_STATE, R_CONTROL and Q_T_STATE, with _ for spaces."""
     entries = {matrix: system.control_names if matrix == "R" else system.state_names for matrix in MATRICES}
     return {
@@ -59,7 +59,7 @@ def weights_of(system: ControlAffineSystem) -> dict[str, Weight]:
     }  # fmt: skip
 
 
-def _spellings(system: ControlAffineSystem) -> dict[str, str]:
+def _spellings(system: ControlSystem) -> dict[str, str]:
     """cost.R.0, cost.R.torque and R_torque ↦ R_torque; without the last where a number of the system has that name."""
     found = dict[str, str]()
     for name, (matrix, i) in weights_of(system).items():
@@ -96,7 +96,7 @@ def weighted_matrices(
         return DiagonalWeights(cost, list(weights.values()), torch.tensor(least, dtype=torch.float64))
 
 
-def with_weights(config: CostConfig, values: Mapping[Weight, float], system: ControlAffineSystem) -> dict[str, Any]:
+def with_weights(config: CostConfig, values: Mapping[Weight, float], system: ControlSystem) -> dict[str, Any]:
     """The matrices of a quadratic cost as rows, with values of some weights; those without weights are left out."""
     matrices = dict[str, list[list[float]]]()
     for (matrix, i), value in values.items():

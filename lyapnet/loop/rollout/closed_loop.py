@@ -7,7 +7,7 @@ from lyapnet.base.types import Control, State, Time
 from lyapnet.task.cost import Cost
 from lyapnet.task.noise import Noise
 from lyapnet.task.problem import Problem
-from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.task.systems import ControlSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import PolicyOutput, ValuePolicy
 
@@ -15,7 +15,7 @@ from lyapnet.value.policy import PolicyOutput, ValuePolicy
 class ClosedLoop(nn.Module):
     """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
 
-    system: ControlAffineSystem
+    system: ControlSystem
     cost: Cost
     policy: nn.Module
     noise: Noise | None

@@ -1,8 +1,16 @@
 """The registered systems. A new one is a subclass and one line in SYSTEMS, or `module:Class` in a config."""
 
 from lyapnet.task.systems.acrobot import Acrobot
-from lyapnet.task.systems.base import ControlAffineSystem, MechanicalSystem, moving_states
+from lyapnet.task.systems.base import (
+    ControlAffineSystem,
+    ControlSystem,
+    MechanicalSystem,
+    functions_of_state,
+    moving_states,
+)
 from lyapnet.task.systems.cartpole import Cartpole
+from lyapnet.task.systems.glider import Glider
+from lyapnet.task.systems.kinematic_bicycle import KinematicBicycle
 from lyapnet.task.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
 from lyapnet.task.systems.path_tracking import PathTracking
 from lyapnet.task.systems.pendulum import Pendulum
@@ -13,7 +21,7 @@ from lyapnet.task.systems.rocket import Rocket
 from lyapnet.task.systems.three_link_arm import ThreeLinkArm
 from lyapnet.task.systems.van_der_pol import VanDerPol
 
-SYSTEMS: dict[str, type[ControlAffineSystem]] = {
+SYSTEMS: dict[str, type[ControlSystem]] = {
     "double_integrator": DoubleIntegrator,
     "integrator_chain": IntegratorChain,
     "linear": Linear,
@@ -29,6 +37,8 @@ SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "rocket": Rocket,
     "van_der_pol": VanDerPol,
     "path_tracking": PathTracking,
+    "kinematic_bicycle": KinematicBicycle,
+    "glider": Glider,
 }
 
 __all__ = [
@@ -37,8 +47,11 @@ __all__ = [
     "BodyFrameQuadrotor",
     "Cartpole",
     "ControlAffineSystem",
+    "ControlSystem",
     "DoubleIntegrator",
+    "Glider",
     "IntegratorChain",
+    "KinematicBicycle",
     "Linear",
     "MechanicalSystem",
     "PathTracking",
@@ -50,6 +63,7 @@ __all__ = [
     "Satellite",
     "ThreeLinkArm",
     "VanDerPol",
+    "functions_of_state",
     "is_linear",
     "moving_states",
 ]

@@ -1,9 +1,9 @@
-"""The base classes of systems: control-affine dynamics with named coordinates."""
+"""The base classes of systems: dynamics with named coordinates, control-affine or not."""
 
 import inspect
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -15,15 +15,17 @@ from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, ControlMatrix, Coordinates, InputMatrix, MassMatrix, PerState, State
 
+HOLDING_STEPS = 20  # Gauss–Newton steps towards the control that holds a state
 
-class ControlAffineSystem(nn.Module, ABC):
-    """ẋ = f(x) + g(x)u with n states and m controls.
 
-    A subclass implements f and g with torch operations on tensors of any leading shape, and declares its coordinates.
-    Physical parameters are constructor arguments, stored as Python floats or buffers. A subclass may have a method
-    `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction. It may also have a method `noise(x)`,
-    σ(x) of shape (*batch, n, k) in state units per √s, if it is driven by noise: dx = (f + gu)dt + σ(x)dW. A method
-    `output(x)`, h(x) of shape (*batch, p), says what is measured of a state, if that is not the state itself.
+class ControlSystem(nn.Module, ABC):
+    """ẋ = F(x, u) with n states and m controls, which need not be affine in u; see ControlAffineSystem for f + gu.
+
+    A subclass implements `dynamics` with torch operations on tensors of any leading shape, and declares its
+    coordinates. Physical parameters are constructor arguments, stored as Python floats or buffers. A subclass may have
+    a method `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction. It may also have a method
+    `noise(x)`, σ(x) of shape (*batch, n, k) in state units per √s, if it is driven by noise: dx = F dt + σ(x)dW. A
+    method `output(x)`, h(x) of shape (*batch, p), says what is measured of a state, if that is not the state itself.
     """
 
     state_names: Sequence[str] = ()
@@ -35,16 +37,48 @@ class ControlAffineSystem(nn.Module, ABC):
     settings: Sequence[int] = ()  # states that are told, as no reading tells them: targets, the time on a reference
 
     @abstractmethod
-    def f(self, x: State) -> State:
-        """The drift: ẋ at u = 0, in state units per second."""
-
-    @abstractmethod
-    def g(self, x: State) -> InputMatrix:
-        """The input matrix ∂ẋ/∂u."""
-
     def dynamics(self, x: State, u: Control) -> State:
-        """ẋ = f(x) + g(x)u."""
-        return self.f(x) + apply(self.g(x), u)
+        """ẋ, in state units per second."""
+
+    @property
+    def affine(self) -> bool:
+        """Whether ẋ = f(x) + g(x)u with the methods f and g."""
+        return False
+
+    def f(self, x: State) -> State:
+        """The drift of a control-affine system; others refuse it.
+
+        Raises:
+            UsageError: the system is not control-affine.
+        """
+        raise _not_affine(self)
+
+    def g(self, x: State) -> InputMatrix:
+        """The input matrix of a control-affine system; others refuse it.
+
+        Raises:
+            UsageError: the system is not control-affine.
+        """
+        raise _not_affine(self)
+
+    def affine_model(self, x: State, u: Control) -> tuple[State, InputMatrix]:
+        """(F − F_u u, F_u) at (x, u), with which f + gu is the dynamics to first order in u; (f, g) if it is affine.
+
+        F_u is computed by automatic differentiation, and differentiable where gradients are recorded.
+        """
+        if self.affine:
+            return self.f(x), self.g(x)
+        recording = torch.is_grad_enabled()
+        with torch.enable_grad():
+            u = u if recording and u.requires_grad else u.detach().requires_grad_()
+            # one copy of (x, u) for each component of ẋ: all rows of the Jacobian in one backward pass
+            copies = u.expand(self.n, *u.shape)
+            rate = self.dynamics(x.expand(self.n, *x.shape), copies)
+            rows = torch.eye(self.n).to(rate).reshape(self.n, *[1] * (rate.ndim - 2), self.n).expand_as(rate)
+            (g,) = torch.autograd.grad(rate, copies, rows, create_graph=recording, materialize_grads=True)
+            rate, g = rate[0], g.movedim(0, -2)
+            parts = rate - apply(g, u), g
+        return parts if recording else (parts[0].detach(), parts[1].detach())
 
     @property
     def reference_time(self) -> int | None:
@@ -56,10 +90,23 @@ class ControlAffineSystem(nn.Module, ABC):
         return x
 
     def holding_control(self, x: State) -> tuple[Control, State]:
-        """The u that holds a state (n,), f(x) + g(x)u = 0, as the least squares solution of least norm; and its ẋ."""
-        f, g = self.f(x), self.g(x)
-        u = -apply(torch.linalg.pinv(g), f)
-        return u, f + apply(g, u)
+        """The u that holds a state (n,), F(x, u) = 0, as the least squares solution of least norm, and its ẋ.
+
+        By Gauss–Newton steps from u = 0, of which the first is exact for a control-affine system.
+        """
+        if self.affine:
+            f, g = self.f(x), self.g(x)
+            u = -apply(torch.linalg.pinv(g), f)
+            return u, f + apply(g, u)
+        with torch.no_grad():
+            u = best = x.new_zeros(self.m)
+            least = self.dynamics(x, u).norm()
+            for _ in range(HOLDING_STEPS):
+                f, g = self.affine_model(x, u)
+                u = u - apply(torch.linalg.pinv(g.nan_to_num(0, 0, 0)), (f + apply(g, u)).nan_to_num(0, 0, 0))
+                left = self.dynamics(x, u).norm()
+                best, least = (u, left) if bool(left < least) else (best, least)
+            return best, self.dynamics(x, best)
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
         """The shapes of the system in a state (n,) under a control (m,), in a plane in metres; by default none.
@@ -130,7 +177,7 @@ class ControlAffineSystem(nn.Module, ABC):
                 raise UsageError(f"Expected {name}.{attribute} as indices of states, got {listed!r}; count from 0.")
 
     def _refuse_hidden_names(self) -> None:
-        base, name = ControlAffineSystem, type(self).__name__
+        base, name = ControlSystem, type(self).__name__
         for attribute in dir(base):
             if not attribute.startswith("_") and callable(getattr(base, attribute)):
                 value = getattr(self, attribute)
@@ -160,9 +207,43 @@ class ControlAffineSystem(nn.Module, ABC):
         return _with_units(self.control_names, self.control_units)
 
 
-def moving_states(system: ControlAffineSystem) -> list[int]:
+class ControlAffineSystem(ControlSystem):
+    """ẋ = f(x) + g(x)u: a subclass implements f and g instead of the dynamics."""
+
+    @abstractmethod
+    def f(self, x: State) -> State:
+        """The drift: ẋ at u = 0, in state units per second."""
+
+    @abstractmethod
+    def g(self, x: State) -> InputMatrix:
+        """The input matrix ∂ẋ/∂u."""
+
+    def dynamics(self, x: State, u: Control) -> State:
+        """ẋ = f(x) + g(x)u."""
+        return self.f(x) + apply(self.g(x), u)
+
+    @property
+    def affine(self) -> bool:
+        return True
+
+
+def _not_affine(system: ControlSystem) -> UsageError:
+    return UsageError(
+        f"Expected a control-affine system with f(x) and g(x), got {type(system).__name__}, whose dynamics(x, u) need "
+        "not be affine in u; derive it from lyapnet.ControlAffineSystem if they are, or leave out what needs f + gu."
+    )
+
+
+def moving_states(system: ControlSystem) -> list[int]:
     """The indices of the states that are neither parameters of a family nor told, as the time on a reference."""
     return [i for i in range(system.n) if i not in system.constants and i not in system.settings]
+
+
+def functions_of_state(system: ControlSystem, u: Control) -> dict[str, Callable[[State], Tensor]]:
+    """f(x) and g(x) by their names in messages; of a system that is not affine, ẋ under a control (m,)."""
+    if system.affine:
+        return {"f(x)": system.f, "g(x)": system.g}
+    return {"dynamics(x, u)": lambda x: system.dynamics(x, u.to(x).expand(*x.shape[:-1], -1))}
 
 
 class MechanicalSystem(ControlAffineSystem):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, PerState, State
-from lyapnet.task.systems.base import ControlAffineSystem, require_positive
+from lyapnet.task.systems.base import ControlAffineSystem, ControlSystem, require_positive
 
 
 class Linear(ControlAffineSystem):
@@ -51,7 +51,7 @@ class Linear(ControlAffineSystem):
         return apply(self.A, x) + apply(self.B, u)
 
 
-def is_linear(system: ControlAffineSystem) -> TypeGuard[Linear]:
+def is_linear(system: ControlSystem) -> TypeGuard[Linear]:
     """Whether a system is Linear and no subclass overrides f, g or dynamics."""
     return isinstance(system, Linear) and all(
         getattr(type(system), name) is getattr(Linear, name) for name in ("f", "g", "dynamics")

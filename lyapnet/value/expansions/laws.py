@@ -10,6 +10,7 @@ from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, PerState, State, StatePath, ValuePath
 from lyapnet.task.problem import Problem, Response
 from lyapnet.task.sets import about_control
+from lyapnet.value.expansions.control_search import Objective, minimise_over_controls, starts_of
 from lyapnet.value.risk import equivalent_derivatives
 
 
@@ -50,16 +51,21 @@ def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
     return Expansion(x, value, *(torch.cat([part[:1], new]) for part, new in zip((p, H), later, strict=True)))
 
 
-def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
+def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
     """The control held for Δt that minimises ∫ℓ + V(F(x, u)), for V with gradient V_x at F(x, 0) and curvature H.
 
     It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu + s(u) over U, with B = F_u/Δt: without limits and
     s, −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with
     others u also changes q within the step. With a target, u − u* replaces u in uᵀRu, and f + gu* replaces f.
 
+    A system that is not control-affine has the minimiser of ∫ℓ + V(F(x, u)) itself for this quadratic V.
+
     Args:
-        free: the step with the control at rest.
+        x: the state at which the step begins.
+        free: the step with the control at rest, or else with the nominal one.
     """
+    if not problem.system.affine:
+        return _control_of_quadratic(problem, x, free, V_x, H)
     B = free.by_control
     weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
@@ -69,6 +75,27 @@ def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Con
     return u if free.u is None else u + free.u
 
 
+def _control_of_quadratic(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
+    """argmin over u ∈ U of `step_objective`."""
+    assert free.u is not None
+    Q, weight = step_objective(problem, x, free, V_x, H), 2 * problem.cost.R(x)
+    paid = problem.smooth_rates(x, free.u)[1]
+    return minimise_over_controls(problem, Q, starts_of(problem, Q, free.u, paid, weight), weight)
+
+
+def step_objective(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Objective:
+    """(∫ℓ + V_xᵀδ + ½ δᵀHδ)/Δt without s(u), with δ = F(x, u) − F(x, ū) and ū the control of a response at x."""
+    assert free.u is not None
+    dt, rate = problem.horizon.dt, problem.smooth_rates(x, free.u)[0]
+
+    def Q(u: Control) -> PerState:
+        moved, cost = problem.smooth_rates(x.expand(*u.shape[:-1], -1), u)
+        delta = moved - rate  # not of next states, whose rounding would be larger
+        return cost + (V_x * delta).sum(-1) + dt / 2 * (apply(H, delta) * delta).sum(-1)
+
+    return Q
+
+
 def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
     """The law (n, x_n) ↦ u_n: the held control for V from an expansion."""
     expansion = certainty_equivalents(problem, expansion)
@@ -76,7 +103,7 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
     def law(n: int, x: State) -> Control:
         H, free = expansion.hessian[n + 1], problem.response(x)
         V_x = expansion.gradient[n + 1] + apply(H, free.x - expansion.x[n + 1])
-        return held_control(problem, free, V_x, H)
+        return held_control(problem, x, free, V_x, H)
 
     return law
 

@@ -62,9 +62,9 @@ def _poles_of(problem: Problem) -> Poles | None:
     """The poles of f, g, q and φ, where they divide by zero; searched once for each problem."""
     if "poles" not in problem.findings:
         own = in_float64(problem)
-        f, g, cost = own.system.f, own.system.g, own.cost
+        functions = [*own.functions_of_state.values(), own.cost.state, own.cost.terminal]
         problem.findings["poles"] = poles_of(
-            lambda x: (f(x), g(x), cost.state(x), cost.terminal(x)), own.initial_states.center
+            lambda x: tuple(function(x) for function in functions), own.initial_states.center
         )
     return problem.findings["poles"]
 

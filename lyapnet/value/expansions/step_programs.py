@@ -168,7 +168,7 @@ class _FollowStep(nn.Module):
     def forward(self, center: State, p: State, H: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
         x = y[..., :-1]
         free = self.problem.response(x)
-        u = held_control(self.problem, free, p + apply(H, free.x - center), H)
+        u = held_control(self.problem, x, free, p + apply(H, free.x - center), H)
         return _advance(self.problem, y, u)
 
 

@@ -130,6 +130,7 @@ def test_every_shipped_config_is_a_task_of_the_sheet():
         "reacher_circle",
         "rocket",
         "minimum_time",
+        "kinematic_bicycle",
     }
     assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, *OWN, *alone}
     assert {path.stem for path in (CONF / "regions").glob("*.yaml")} == set(REGIONS)

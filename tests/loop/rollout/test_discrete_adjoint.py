@@ -17,13 +17,13 @@ from lyapnet.loop.rollout import FIXED_STEP_METHODS, Rollout, backwards, discret
 from lyapnet.loop.rollout.runge_kutta import Linearise
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
-from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import ACTIVATIONS, FCN, NETWORKS, Scaling
 from lyapnet.value.networks.anchored import TerminalAnchor
 from lyapnet.value.policy import POLICIES, HJBPolicy
 from tests.marks import sample
-from tests.problems import KINDS, problem_of, with_expansion
+from tests.problems import AFFINE, KINDS, problem_of, with_expansion
 
 EXACT = 1e-10  # relative, of what differs by rounding alone
 HORIZON = Horizon(6, 0.05)
@@ -77,10 +77,10 @@ def is_exact(rollouts, x0, of=weighted):
     ("system", "method", "traced"),
     sample(
         [
-            *((system, "euler", False) for system in SYSTEMS),
+            *((system, "euler", False) for system in AFFINE),
             *(
                 pytest.param(system, "euler", True, marks=() if system in KINDS else pytest.mark.gate)
-                for system in SYSTEMS
+                for system in AFFINE
             ),
             *((system, method, False) for system in KINDS for method in FIXED_STEP_METHODS if method != "euler"),
         ],
@@ -349,7 +349,7 @@ def test_padding_with_anything_but_zeros_would(monkeypatch, system, cost, policy
 
 
 @pytest.mark.parametrize(
-    ("system", "traced"), [*((s, False) for s in SYSTEMS), ("double_integrator", True)], indirect=["system"]
+    ("system", "traced"), [*((s, False) for s in AFFINE), ("double_integrator", True)], indirect=["system"]
 )
 def test_single_precision_stays_and_agrees(system, cost, policy, x0):
     discrete, backprop = routes(system, cost, policy)

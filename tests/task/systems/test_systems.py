@@ -10,12 +10,14 @@ import torch
 from scipy.integrate import solve_ivp
 from torch.testing import assert_close
 
+from lyapnet.base.errors import UsageError
 from lyapnet.task.systems import (
     SYSTEMS,
     Acrobot,
     BodyFrameQuadrotor,
     Cartpole,
     DoubleIntegrator,
+    Glider,
     Linear,
     MechanicalSystem,
     PathTracking,
@@ -37,15 +39,32 @@ def draw(system, *batch):
 
 def maps_of(system):
     """Every function of the state that the system offers."""
-    declared = [system.f, system.g, getattr(system, "energy", None), getattr(system, "inverse_mass", None)]
+    declared = [
+        *([system.f, system.g] if system.affine else []),
+        getattr(system, "energy", None),
+        getattr(system, "inverse_mass", None),
+    ]
     return [function for function in declared if function]
 
 
 # Each check is a fact about one system.
 
 
+@pytest.fixture(params=SYSTEMS)
+def system(request, build_system):
+    """Each registered system in turn, whose dynamics may be affine in the control or not."""
+    return build_system(request.param)
+
+
 def is_affine_in_the_control(system):
+    """Or says that it is not: then f and g are refused by name."""
     x, u = draw(system, 6)
+    if not system.affine:
+        assert not torch.allclose(system.dynamics(x, 2 * u) + system.dynamics(x, 0 * u), 2 * system.dynamics(x, u))
+        for refused in (system.f, system.g):
+            with pytest.raises(UsageError, match=f"control-affine system with f.*got {type(system).__name__}"):
+                refused(x)
+        return
     v = torch.randn_like(u)
     assert_close(system.dynamics(x, u), system.f(x) + torch.einsum("bnm,bm->bn", system.g(x), u))
     assert_close(system.dynamics(x, u) + system.dynamics(x, v), system.dynamics(x, u + v) + system.f(x))
@@ -72,9 +91,16 @@ def is_differentiable(system):
 def rests_at_the_origin(system):
     """Without control; on a circle, with the steering that goes round it; a rocket hovers."""
     u = torch.tensor([0.1]) if isinstance(system, PathTracking) else torch.zeros(system.m)
+    x = torch.zeros(system.n)
     if isinstance(system, Rocket):
         u[-1] = system.gravity
-    assert_close(system.dynamics(torch.zeros(system.n), u), torch.zeros(system.n))
+    if isinstance(system, Glider):  # down a slope of drag/lift, as fast as the force of the air equals the weight
+        u[0] = 0.1
+        lift = system.lift_slope * u
+        drag = system.drag + system.induced * lift**2
+        pressure = system.mass * system.gravity / torch.hypot(lift, drag) / (system.density * system.area / 2)
+        x = torch.cat([pressure.sqrt(), -torch.atan(drag / lift)])
+    assert_close(system.dynamics(x, u), torch.zeros(system.n))
 
 
 def names_its_coordinates(system):

@@ -99,7 +99,7 @@ def test_the_held_control_is_the_least_of_a_step(solved):
     A = torch.randn(n, n, generator=torch.Generator().manual_seed(2)).double()
     P, p = A @ A.mT + torch.eye(n).double(), torch.linspace(-1, 1, n).double()
     free = problem.response(x)
-    u = held_control(problem, free, free.x @ P + p, P.expand(3, n, n))
+    u = held_control(problem, x, free, free.x @ P + p, P.expand(3, n, n))
 
     def cost(u):
         after, paid = problem.step(x.expand(*u.shape[:-1], -1), u)

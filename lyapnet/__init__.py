@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lyapnet.prover.branch_and_bound import Budget
     from lyapnet.task.ball import ControlBall
     from lyapnet.task.constraints import AllOf, Ball, Constraints, StateLimits
-    from lyapnet.task.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
+    from lyapnet.task.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost, TimeCost
     from lyapnet.task.cost.control_costs import (
         AbsoluteCost,
         ControlCost,
@@ -67,7 +67,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "evaluation.measurement": ["evaluate"],
     "exchange.export": ["export"],
     "controller.controller": ["ArrayTrajectory", "Controller"],
-    "task.cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
+    "task.cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost", "TimeCost"],
     "task.cost.control_costs": [
         "AbsoluteCost",
         "ControlCost",
@@ -153,6 +153,7 @@ __all__ = [
     "Statistical",
     "Table",
     "TargetCost",
+    "TimeCost",
     "Tolerances",
     "Trajectory",
     "Tube",

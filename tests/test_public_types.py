@@ -19,7 +19,7 @@ from tests.pages import ROOT
 
 pytest.importorskip("pyright", reason="pyright comes with the development extra")
 
-DECLARED = "    system: ControlAffineSystem\n"  # of Problem
+DECLARED = "    system: ControlSystem\n"  # of Problem
 STRICT = {"include": ["right.py", "wrong.py"], "typeCheckingMode": "strict"}
 SCRIPT = """
 from dataclasses import dataclass

@@ -13,6 +13,7 @@ from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.prover.proof import prove
 from lyapnet.prover.taylor import box_form
+from lyapnet.task.cost.minimum import LEAST
 from tests.claims.planted import domain, loop, riccati
 from tests.functions import FUNCTIONS
 from tests.marks import sample
@@ -48,12 +49,12 @@ def differences(forms, others):
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("operation", sample(CASES, 8), ids=str)
 def test_bounds_are_those_of_the_interpreter(operation, degree):
-    """Except for rounding: machine code counts fewer operations."""
+    """Except for rounding: machine code counts fewer operations, of a minimum over controls more."""
     found = both(graph_of(CASES[operation], 0), *random_boxes(120, 0), degree)
     assert (found is None) == (operation in WITHOUT_A_RULE)
     if found is not None:
         outside, inside = differences(*found)
-        assert outside < 1e-12
+        assert outside < (1e-11 if operation is LEAST else 1e-12)
         assert inside < 1e-10
 
 

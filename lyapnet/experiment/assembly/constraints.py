@@ -33,6 +33,11 @@ def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constrai
     system = problem.system
     with section("constraints"):
         parts: list[Constraints] = [*_limits(config, problem), *_balls(config, system)]
+        if config.name in CONSTRAINTS and config.parameters:
+            raise UsageError(
+                f"Expected no constraints.parameters without a class in constraints.name, got {config.parameters}; "
+                "name your class, or leave them out."
+            )
         if own is None and config.name not in CONSTRAINTS:
             own = instance_of(config, "constraints")
         if own is not None:

@@ -247,9 +247,9 @@ class ControlBox(ControlSet):
 
         A control that U does not let have its sign is at its limit on the other side.
         """
-        low = torch.where(signs > 0, self.lower.clamp_min(0), self.lower)
+        low = torch.minimum(torch.where(signs > 0, self.lower.clamp_min(0), self.lower), self.upper)
         high = torch.maximum(torch.where(signs < 0, self.upper.clamp_max(0), self.upper), low)
-        return self._minimise_between(R, b, torch.minimum(low, self.upper), high)
+        return self._minimise_between(R, b, low, high)
 
     def _minimise_between(self, R: ControlMatrix, b: Control, low: Tensor, high: Tensor) -> Control:
         """argmin of uᵀRu + bᵀu over low ≤ u ≤ high, for more than one control."""

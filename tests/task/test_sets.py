@@ -1,5 +1,6 @@
 """Boxes of states against brute force; sets of controls."""
 
+import itertools
 import math
 
 import numpy as np
@@ -337,3 +338,12 @@ def test_two_controls_that_are_not_coupled_have_their_derivatives():
     assert_close(slope[inside][:, 1], -0.5 / R[inside][:, 1, 1])
     assert not slope[~inside][:, 1].any()
     assert 0 < inside.double().mean() < 1
+
+
+@pytest.mark.parametrize("limits", [(-1.0, -0.5), (0.5, 1.0), (-1.0, 0.0), (0.0, 1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize("m", [2, 3])
+def test_in_every_orthant_controls_stay_within_limits(m, limits):
+    low, high = limits
+    U, R, b = ControlBox([low] * m, [high] * m), (torch.eye(m) + 0.3).expand(200, m, m), 3 * torch.randn(200, m)
+    for signs in itertools.product((1.0, -1.0), repeat=m):
+        assert bool(U.contains(U.minimise_in_orthant(R, b, torch.tensor(signs))).all())

@@ -24,6 +24,7 @@ from lyapnet.prover.taylor import interval_form
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost.control_costs import CONTROL_COSTS, AbsoluteCost
 from lyapnet.task.cost.minimum import description, is_quadratic_between_limits
+from lyapnet.task.sets import about_control
 from lyapnet.value.policy import HJBPolicy, SampledPolicy, ValuePolicy
 
 POINTS, DESCENTS = 20_000, 20  # where u ∈ U is not proved: points to test, and descent steps from the worst of them
@@ -167,8 +168,9 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
         least = policy.least(points[:, 0], points[:, 1:])
         if least is None:
             return ""
-        R = policy.cost.R(points[:, 1:])
-        right = is_minimum(policy.cost.nonquadratic, policy.controls, R, least.b, least.u)
+        R, rest = policy.cost.R(points[:, 1:]), policy.cost.rest_at(points[:, 1:])
+        b = about_control(R, least.b, rest)
+        right = is_minimum(policy.cost.nonquadratic, policy.controls, R, b, least.u)
     if not bool(right.all()):
         k = int(right.to(torch.uint8).argmin())
         raise UsageError(

@@ -97,8 +97,8 @@ class HJBPolicy(ValuePolicy):
         if type(self).forward is not HJBPolicy.forward or type(self)._minimise is not HJBPolicy._minimise:
             return None
         rest, R = self.cost.rest_at(x), self.cost.R(x)
-        b = about_control(R, input_lie_derivative(self.system, x, self.V.value_and_state_gradient(t, x)[1]), rest)
-        minimum = self.cost.least(self.controls, R, b)
+        b = input_lie_derivative(self.system, x, self.V.value_and_state_gradient(t, x)[1])
+        minimum = self.cost.least(self.controls, R, about_control(R, b, rest))
         if minimum is None:
             return None
         return LeastCost(minimum.u, b, minimum.value if rest is None else minimum.value + quadratic_form(R, rest))

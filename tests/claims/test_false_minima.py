@@ -6,12 +6,14 @@ are cheap enough, or large enough, and the claims differ from true ones in how f
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.cost.control_costs import (
@@ -45,13 +47,15 @@ KINDS = {
 }
 
 
-def parts(kind, a, growth):
-    """(problem, loop) of ẋ = growth x + u, V = 2‖x‖², with limits or a radius a."""
+def parts(kind, a, growth, rest=None, controls=None, strength=1.0):
+    """(problem, loop) of ẋ = growth x + strength u, V = 2‖x‖², with limits or a radius a."""
     costs, limits = KINDS[kind]
-    system = Linear([[growth, 0.3], [-0.3, growth]], [[1.0, 0.0], [0.0, 1.0]])
+    system = Linear([[growth, 0.3], [-0.3, growth]], [[strength, 0.0], [0.0, strength]])
     cost = QuadraticCost(0.2 * torch.eye(2), 0.5 * torch.eye(2), torch.eye(2))
     cost.nonquadratic = ControlCosts(costs) if costs else None
-    problem = problem_of(system, cost, 20, initial_states=Box([-0.5, -0.5], [0.5, 0.5]), controls=limits(a))
+    cost.rest = rest
+    controls = limits(a) if controls is None else controls
+    problem = problem_of(system, cost, 20, initial_states=Box([-0.5, -0.5], [0.5, 0.5]), controls=controls)
     V = Formula(lambda t, x: 2 * (x * x).sum(-1) + 0 * t)
     return problem, ClosedLoop(problem, HJBPolicy(problem, V)).double()
 
@@ -62,7 +66,7 @@ def claimed(kind, a, growth, boxes=BOXES):
     return prove_funnel(loop, problem, ALPHA, DELTA, D, Budget(AMPLE, boxes=boxes)), loop
 
 
-def largest_condition(loop, found):
+def largest_condition(loop, found, delta=DELTA):
     """The largest V̇ + αℓ − δ at states of the funnel of X₀, from f, g, ℓ and u alone, and the largest with ρ."""
     angle = 2 * torch.pi * torch.rand(20_000)
     size = (found.wanted / 2) ** 0.5 * torch.rand(20_000).sqrt()
@@ -70,7 +74,7 @@ def largest_condition(loop, found):
     with torch.no_grad():
         u = loop.policy(torch.zeros(len(x)), x)
         rate = (4 * x * loop.system.dynamics(x, u)).sum(-1)
-        return float((rate + ALPHA * loop.cost.running(x, u) - DELTA).max())
+        return float((rate + ALPHA * loop.cost.running(x, u) - delta).max())
 
 
 LIMITS, GROWTH = 4.0, -0.2  # with which the claim is true
@@ -97,6 +101,30 @@ def test_no_false_claim_is_certified(kind, a, growth):
 
 def test_they_are_fifty():
     assert len(FALSE) == 50
+
+
+@pytest.mark.parametrize("rest", [None, torch.tensor([0.2, -0.1])])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("alpha", [0.3, 1.0])
+def test_the_condition_of_a_minimum_is_that_of_f_g_and_the_cost(kind, rest, alpha):
+    _, loop = parts(kind, 0.7, 0.2, rest)
+    t, x = torch.zeros(1000), torch.randn(1000, 2)
+    with torch.no_grad():
+        paid, most = DecreaseCondition(loop, alpha, DELTA).decrease(t, x)
+        u = loop.policy(t, x)
+        fall = (4 * x * loop.system.dynamics(x, u)).sum(-1)
+        assert_close(paid, fall + alpha * loop.cost.running(x, u))
+        assert bool((most >= fall - 1e-12).all())
+
+
+@pytest.mark.parametrize(("delta", "verdict"), [(0.68, "falsified"), (0.9, "certified")])
+def test_a_control_that_costs_nothing_away_from_zero_counts(delta, verdict):
+    """u* = 0.1 lies on the other side of zero than all of U, which makes each control cost more."""
+    problem, loop = parts("absolute", 1.0, -0.5, torch.tensor([0.1, 0.1]), ControlBox([-1.0] * 2, [-0.5] * 2), 0.01)
+    D = Box([-1.5, -1.5], [1.5, 1.5])
+    found = prove_funnel(loop, problem, ALPHA, delta, D, Budget(AMPLE, boxes=60_000))
+    assert found.verdict == verdict
+    assert (largest_condition(loop, found, delta) > 1e-3) == (verdict == "falsified")
 
 
 # Claims that are refused at once

@@ -18,6 +18,7 @@ from lyapnet.task.cost.minimum import Known
 
 # how exact u and h of the law are: more than FORWARD and BACKWARD of lyapnet.prover.minima add up to
 OF_U, OF_H = 1e-8, 2e-9  # of (|b| + w)/r; and of (b² + w²)/r
+TIED = 512 * torch.finfo(torch.float64).eps  # of the cost: the law takes minima in orthants that are as cheap for equal
 
 
 @runtime_checkable
@@ -79,6 +80,7 @@ def _between_limits(program: Arithmetic, known: Known, bend: Tensor, b: Sequence
     m, controls, values = len(b), list[Any](), list[tuple[float, Any]]()
     w = sum((part.weight for part in absolute), torch.zeros(m, dtype=torch.float64)).tolist()
     low, high = (side.double().expand(m).tolist() for side in known.controls.limits)
+    ties = _ties(program, b, [_Line.of(*numbers) for numbers in zip(bend.tolist(), w, low, high, strict=True)])
     for x, *numbers in zip(b, bend.tolist(), w, low, high, strict=True):
         line = _Line.of(*numbers)
         r, kink, first = line.r, line.w, line.bends[0]
@@ -89,11 +91,27 @@ def _between_limits(program: Arithmetic, known: Known, bend: Tensor, b: Sequence
                 ramp = program.function("leaky", program.combine([(1, x)], -bend_at))
                 u, h = [*u, (change, ramp)], [*h, (change / 2, program.square(ramp))]
         squared = program.combine([(1 / r, program.square(x))], kink * kink / r)
-        u.append((1 / r, _error(program, x, OF_U, OF_U * kink)))
+        u += [(1 / r, _error(program, x, OF_U, OF_U * kink)), *((weight / r**0.5, tie) for weight, tie in ties)]
         h.append((1.0, _error(program, squared, OF_H)))
         controls.append(program.combine(u, line.u, operations=len(u) + 2))
         values.append((1.0, program.combine(h, line.h, operations=len(h) + 2)))
     return controls, program.combine(values, operations=m)
+
+
+def _ties(program: Arithmetic, b: Sequence[Any], lines: Sequence["_Line"]) -> list[tuple[float, Any]]:
+    """Summands of √rᵢ times an error of each uᵢ where costs |u| are minimised in each orthant, and the cheapest taken.
+
+    Rounding hides TIED of E = Σⱼ |uⱼ|(rⱼ|uⱼ| + |bⱼ| + wⱼ) ≤ 2 Σⱼ (|bⱼ| + wⱼ + rⱼ least |uⱼ|)²/rⱼ; ½ rᵢ(Δuᵢ)² is at most
+    that.
+    """
+    if len(b) == 1 or not any(line.w for line in lines):
+        return []
+    share = (2 * TIED) ** 0.5
+    sizes = [line.w + line.r * line.least for line in lines]
+    return [
+        (2 / line.r**0.5, _error(program, x, share, share * size))
+        for x, line, size in zip(b, lines, sizes, strict=True)
+    ]
 
 
 def _error(program: Arithmetic, x: Any, relative: float, absolute: float = 0.0) -> Any:
@@ -110,6 +128,7 @@ class _Line(NamedTuple):
     slopes: list[float]  # left of the first, between them, and right of the last
     u: float  # at the first bend
     h: float  # the minimum there
+    least: float  # the least |u|
 
     @staticmethod
     def of(r: float, w: float, low: float, high: float) -> "_Line":
@@ -124,4 +143,4 @@ class _Line(NamedTuple):
         outer = [-1 / r if math.isinf(side) else 0.0 for side in (high, low)]
         at = u(bends[0])
         value = (r / 2 * at + bends[0]) * at + w * abs(at)
-        return _Line(r, w, bends, [outer[0], *inner, outer[1]], at, value)
+        return _Line(r, w, bends, [outer[0], *inner, outer[1]], at, value, max(low, -high, 0.0))

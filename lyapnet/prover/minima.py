@@ -31,7 +31,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import apply
 from lyapnet.prover import taylor
 from lyapnet.prover.branches import relu
-from lyapnet.prover.closed_minima import closed_minimum
+from lyapnet.prover.closed_minima import TIED, closed_minimum
 from lyapnet.prover.elementary_functions import Elementary, square
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
@@ -138,14 +138,12 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
     D, doubt = _slopes(program._replace(reach=far))
     y = b.with_parts(torch.cat([torch.zeros_like(b.terms[:1]), b.terms[1:]]), b.radius)
     Dy = _linear(D, y)
-    radius = Dy.radius + apply(D.abs(), off) + apply(doubt, far) + near
+    radius = Dy.radius + apply(D.abs(), off) + apply(doubt, far) + 2 * near + _ties(program)
     law = Dy.with_parts(torch.cat([u[None], Dy.terms[1:]]), radius * (1 + ROOM)).with_rounding()
     curved, straight = taylor.multiply(y, Dy), y.with_parts(y.terms * u, y.radius * u.abs()).with_rounding()
     h = taylor.add(straight, curved.with_parts(curved.terms / 2, curved.radius / 2)).with_rounding(len(u[0]))
     error = far * apply(doubt, far) / 2 + program.size * apply(spread, program.size)
-    error = (
-        error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + 32 * EPSILON * program.size) * forces
-    )
+    error = error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + TIED * program.size) * forces
     terms, radius = h.terms.sum(-1, keepdim=True), (h.radius + error * (1 + ROOM)).sum(-1, keepdim=True)
     h = h.with_parts(torch.cat([terms[:1] + value[:, None], terms[1:]]), radius).with_rounding()
     terms, radius = torch.cat([law.terms, h.terms], -1), torch.cat([law.radius, h.radius], -1)
@@ -247,8 +245,15 @@ def _stiffness(W: Matrices, spread: Matrices) -> Float[Tensor, "boxes 1"]:
 
 
 def _sizes(controls: ControlSet, W: Matrices, spread: Matrices, b: Vectors) -> Vectors:
-    """A bound of |uᵢ|: its limits; and ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W, if U contains 0."""
+    """A bound of |uᵢ|: its limits; and ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W, if U contains 0.
+
+    Args:
+        b: bounds of |b|.
+    """
     free = b.norm(dim=-1, keepdim=True) * (1 + ROOM) / (2 * _stiffness(W, spread))
+    diagonal = W.diagonal(dim1=-2, dim2=-1)
+    if not bool((W - torch.diag_embed(diagonal)).any()) and not bool(spread.any()):
+        free = b * (1 + ROOM) / (2 * diagonal)  # of each control by itself, and less in a ball
     if controls.limits is None:
         return free.expand_as(b)
     low, high = (side.to(b) for side in controls.limits)
@@ -272,14 +277,22 @@ def _is_minimum(program: _Program, u: Vectors, tolerance: Vectors) -> Tensor:
         (low, high) = program.limits
         holds = (above >= -tolerance) & (below <= tolerance) & (u >= low - near) & (u <= high + near)
         return holds.all(-1, keepdim=True)
-    w, radius = program.kinks[0], program.limits[1][0]
+    w, radius, near = program.kinks[0], program.limits[1][0], near.amax(-1, keepdim=True)
     size, most = u.norm(dim=-1, keepdim=True), tolerance.amax(-1, keepdim=True)
-    still = size <= near[:, :1]
+    still = size <= near
     pull = w / torch.where(still, 1.0, size)
     rim = (-(slope * u).sum(-1, keepdim=True) / torch.where(still, 1.0, size * size)).maximum(pull)
-    rest = slope + torch.where(size >= radius - near[:, :1], rim, pull) * u
-    moving = (rest.norm(dim=-1, keepdim=True) <= most) & (size <= radius + near[:, :1])
+    rest = slope + torch.where(size >= radius - near, rim, pull) * u
+    moving = (rest.norm(dim=-1, keepdim=True) <= most) & (size <= radius + near)
     return torch.where(still, program.middle.norm(dim=-1, keepdim=True) <= w + most, moving)
+
+
+def _ties(program: _Program) -> Vectors:
+    """An error of u where costs |u| are minimised in each orthant: see lyapnet.prover.closed_minima."""
+    if program.radial or len(program.kinks) == 1 or not bool(program.kinks.any()):
+        return torch.zeros_like(program.middle)
+    hidden = TIED * (program.size * program.forces).sum(-1, keepdim=True)
+    return (torch.linalg.inv(program.W).diagonal(dim1=-2, dim2=-1).clamp_min(0) * hidden).sqrt() * (1 + ROOM)
 
 
 def _slopes(program: _Program) -> tuple[Matrices, Matrices]:

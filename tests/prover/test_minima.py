@@ -195,6 +195,33 @@ def test_a_law_that_is_no_minimum_has_no_bounds(monkeypatch):
         examine(s, U, 2, "diagonal", 2, 10, 10)
 
 
+@pytest.mark.parametrize("coupling", [0.0, 0.01])
+@pytest.mark.parametrize("costs", [[AbsoluteCost(0.01)], [AbsoluteCost(0.01), PowerCost(1e-6, 3)]])
+def test_no_control_lies_outside_where_another_one_hides_its_cost(costs, coupling):
+    """b₂ is so close to a kink that the cheapest of the minima in orthants is lost in the rounding of b₁'s cost."""
+    s, U, W = ControlCosts(costs), Unbounded(), torch.tensor([[0.5, coupling], [coupling, 0.5]])
+    bounded = BoundedFunction(lambda t, x: tuple(traced_minimum(s, U, W, x)), (-CORNER, CORNER))
+    off = torch.linspace(-5e-7, 5e-7, 1000)
+    second = 2 * coupling * 99.99 + off + 0.01 * off.sign()
+    b = torch.stack([torch.full_like(off, 100.0), second], -1)
+    at = torch.cat([torch.zeros(len(b), 1), b], -1)
+    law = least_over(s, U, W.expand(len(b), 2, 2), b)
+    for kernel in (None, bounded.kernel(at - 1e-9, at + 1e-9)):
+        box = at - 1e-9, at + 1e-9
+        form = (bounded.image(box_form(*box, 2)) if kernel is None else kernel.forms(*box))[0]
+        low, high = form.interval()
+        assert bool(((low <= law.u) & (law.u <= high)).all())
+
+
+def test_a_sum_of_costs_of_a_users_own_has_no_description():
+    class Twice(ControlCosts):
+        def forward(self, u):
+            return 2 * super().forward(u)
+
+    assert make_known(ControlCosts([AbsoluteCost(0.5)]), Unbounded()) is not None
+    assert make_known(Twice([AbsoluteCost(0.5)]), Unbounded()) is None
+
+
 def test_a_description_has_all_numbers():
     costs = [ControlCosts([PowerCost(0.5, p)]) for p in (1.5, 1.5000000001)] + [ControlCosts([LogCosCost(0.5, 2.2)])]
     sets = [ControlBall(1.0), ControlBall(1 + 1e-15), ControlBox(-1.0, 1.0), Unbounded()]

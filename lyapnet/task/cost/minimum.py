@@ -56,7 +56,7 @@ class Known(NamedTuple):
 def description(costs: ControlCosts | None, controls: ControlSet) -> str | None:
     """All that defines s and U, as text; None if a class is not lyapnet's own."""
     parts = [] if costs is None else [*costs.costs]
-    own = {*CONTROL_COSTS.values()}.issuperset(map(type, parts))
+    own = {*CONTROL_COSTS.values()}.issuperset(map(type, parts)) and type(costs) in (ControlCosts, type(None))
     if not own or type(controls) not in (ControlBall, ControlBox, Unbounded) or (costs and float(costs.softness)):
         return None
     return "; ".join(f"{type(part).__name__}({', '.join(_numbers(part))})" for part in (*parts, controls))

@@ -86,7 +86,9 @@ class DecreaseCondition(nn.Module):
         as ℓ ≥ q. The law's b is gᵀV_x, so that errors of u in bounds hardly count.
         """
         loop = self.closed_loop
-        least = loop.policy.least(t, x) if isinstance(loop.policy, ValuePolicy) else None
+        least = None
+        if isinstance(loop.policy, ValuePolicy) and loop.policy.cost is loop.cost:  # u may be made for another ℓ
+            least = loop.policy.least(t, x)
         if least is None:
             u = loop.policy(t, x)
             fall = self._pushed(time_derivative(self.V, loop.system, t, x, u), t, x)

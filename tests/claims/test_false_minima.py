@@ -117,6 +117,16 @@ def test_the_condition_of_a_minimum_is_that_of_f_g_and_the_cost(kind, rest, alph
         assert bool((most >= fall - 1e-12).all())
 
 
+def test_a_law_that_minimises_another_cost_is_no_minimum_of_this_one():
+    (_, loop), (problem, _) = parts("absolute", 1.0, 0.1), parts("power 3", 1.0, 0.1)
+    mixed = ClosedLoop(problem, loop.policy).double()
+    t, x = torch.zeros(100), torch.randn(100, 2)
+    with torch.no_grad():
+        u = mixed.policy(t, x)
+        paid = (4 * x * mixed.system.dynamics(x, u)).sum(-1) + mixed.cost.running(x, u)
+        assert_close(DecreaseCondition(mixed, 1.0, DELTA).decrease(t, x)[0], paid)
+
+
 @pytest.mark.parametrize(("delta", "verdict"), [(0.68, "falsified"), (0.9, "certified")])
 def test_a_control_that_costs_nothing_away_from_zero_counts(delta, verdict):
     """u* = 0.1 lies on the other side of zero than all of U, which makes each control cost more."""

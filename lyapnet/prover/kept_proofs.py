@@ -37,7 +37,7 @@ from lyapnet.prover.branch_and_bound import Search, just_below
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.operators import files
-from lyapnet.task import ball
+from lyapnet.task import ball, sets
 from lyapnet.task.cost import control_costs, minimum
 
 SOURCES = (Path(__file__).parent,)
@@ -45,14 +45,14 @@ SOURCES = (Path(__file__).parent,)
 
 f, g, ℓ, V, u and the code that assembles c from them are not listed: the fingerprint of the traced function contains
 all their operations and numbers. The file of the tracing is hashed too, because it merges equal operations, and those
-of costs of controls, whose minimum is one operation.
+of costs and sets of controls, whose minimum is one operation.
 """
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     """A hash of the code in the folders and of the tracing, compiler flags, torch's version and own operators."""
     found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
-    for file in (tracing.__file__, ball.__file__, control_costs.__file__, minimum.__file__):
+    for file in (tracing.__file__, ball.__file__, control_costs.__file__, minimum.__file__, sets.__file__):
         found.update(Path(str(file)).read_bytes())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):

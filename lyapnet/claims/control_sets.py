@@ -22,7 +22,7 @@ from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, searc
 from lyapnet.prover.minima import BACKWARD, is_minimum
 from lyapnet.prover.taylor import interval_form
 from lyapnet.task.ball import ControlBall
-from lyapnet.task.cost.control_costs import CONTROL_COSTS, AbsoluteCost
+from lyapnet.task.cost.control_costs import CONTROL_COSTS, AbsoluteCost, PowerCost
 from lyapnet.task.cost.minimum import description, is_quadratic_between_limits
 from lyapnet.task.sets import about_control
 from lyapnet.value.policy import HJBPolicy, SampledPolicy, ValuePolicy
@@ -128,6 +128,13 @@ def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
         raise UsageError(
             f"Expected costs of controls of lyapnet's own ({', '.join(CONTROL_COSTS)}) between limits or in a ball for "
             f"a {claim} certificate, got {names}; take one of them, or a statistical certificate."
+        )
+    costs = [] if cost.nonquadratic is None else cost.nonquadratic.costs
+    if any(isinstance(each, PowerCost) and each.exponent < 2 for each in costs):
+        # near u = 0, where their curvature has no bound, Newton's method ends 5e-9 from the minimiser, not 1e-10
+        raise UsageError(
+            f"Expected powers of at least 2 as costs of controls for a {claim} certificate, got less in {names}; take "
+            "pseudo_huber, which is smooth, or a statistical certificate."
         )
     if type(policy) is HJBPolicy and not cost.has_methods_of_its_own:
         return

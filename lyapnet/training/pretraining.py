@@ -50,6 +50,7 @@ POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another
 PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
+MIN_OPTIMA = 32  # with fewer, states beyond them outweigh those along them
 TRUST_LIMIT = 0.01  # largest ½ δᵀ|H|δ relative to J for which an expansion is used at a deviation δ
 NEIGHBOUR_TRUST_LIMIT = 1.0  # the same for deviations towards neighbours
 
@@ -139,7 +140,7 @@ def examples_beyond(
 ) -> list[Examples]:
     """Examples along new optima from states at which costly closed loops have left the known ones; see later_optima."""
     problem, ahead = learner.problem, looks_ahead(learner)
-    if problem.horizon.stationary:
+    if problem.horizon.stationary or len(optimum.path.cost) < MIN_OPTIMA:
         return []
     deviation = path.x[:-1] - optimum.expansion.x[:-1]
     is_known = _trusted_share(problem, optimum, deviation, TRUST_LIMIT) >= 1

@@ -172,3 +172,5 @@ def test_a_funnel_refuses_costs_and_laws_that_it_does_not_know():
         lyapnet.certify(controller([FourthPower(0.3)], Unbounded()), lyapnet.Funnel())
     with pytest.raises(UsageError, match=r"with NormCost in ControlBall, got SampledPolicy and QuadraticCost; train"):
         lyapnet.certify(controller([NormCost(0.3)], ControlBall(1.0), SampledPolicy), lyapnet.Funnel())
+    with pytest.raises(UsageError, match=r"powers of at least 2 .* got less in PowerCost .*; take pseudo_huber"):
+        lyapnet.certify(controller([PowerCost(0.3, 1.5)], ControlBox(-1, 1)), lyapnet.Funnel())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.fx import GraphModule
 from torch.fx.node import map_arg
 
@@ -129,8 +129,7 @@ def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
             f"Expected costs of controls of lyapnet's own ({', '.join(CONTROL_COSTS)}) between limits or in a ball for "
             f"a {claim} certificate, got {names}; take one of them, or a statistical certificate."
         )
-    costs = [] if cost.nonquadratic is None else cost.nonquadratic.costs
-    if any(isinstance(each, PowerCost) and each.exponent < 2 for each in costs):
+    if any(isinstance(each, PowerCost) and each.exponent < 2 for each in _costs_of_controls(policy)):
         # near u = 0, where their curvature has no bound, Newton's method ends 5e-9 from the minimiser, not 1e-10
         raise UsageError(
             f"Expected powers of at least 2 as costs of controls for a {claim} certificate, got less in {names}; take "
@@ -148,14 +147,18 @@ def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
 
 def _pays_absolute_values(policy: ValuePolicy) -> bool:
     """Whether controls pay |u| beside uᵀRu, or nothing."""
+    return all(type(cost) is AbsoluteCost for cost in _costs_of_controls(policy))
+
+
+def _costs_of_controls(policy: ValuePolicy) -> list[nn.Module]:
+    """The costs of the controls beside uᵀRu."""
     costs = policy.cost.nonquadratic
-    return costs is None or all(type(cost) is AbsoluteCost for cost in costs.costs)
+    return [] if costs is None else [*costs.costs]
 
 
 def _in_words(policy: ValuePolicy) -> str:
     """The costs of the controls and their set, as in "AbsoluteCost in ControlBox"."""
-    costs = policy.cost.nonquadratic
-    names = [] if costs is None else [type(cost).__name__ for cost in costs.costs]
+    names = [type(cost).__name__ for cost in _costs_of_controls(policy)]
     return f"{' and '.join(names) or 'uᵀRu'} in {type(policy.controls).__name__}"
 
 

@@ -5,13 +5,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from lyapnet.task.cost import spread
 from lyapnet.training.curves import members_of
-from lyapnet.training.learner import Learner, mean_over_processes
+from lyapnet.training.learner import Learner, number_over_processes
 
 RATE_DIVISOR = 3.0  # each return divides the learning rate by this
 WORSE_BY = 0.01  # relative cost above that of the best weights from which on training counts as worse
@@ -79,7 +78,9 @@ class ReturnToBest(Callback):
         """Compare a member with its best weights, and keep or restore them."""
         assert member.validation is not None
         step, best = trainer.global_step, self.best[member.label]
-        loss, cost, cheapest, spread_of_costs = (_mean_over_processes(value, member) for value in _measures(member))
+        loss, cost, cheapest, spread_of_costs = (
+            number_over_processes(value, member.problem.goal.device) for value in _measures(member)
+        )
         if loss < best.loss or not math.isfinite(best.loss):
             best.loss, best.step, best.cost, best.cheapest, best.worse_since = loss, step, cost, cheapest, None
             best.weights = {name: value.clone() for name, value in member.V.state_dict().items()}
@@ -125,11 +126,6 @@ def _measures(member: Learner) -> tuple[float, float, float, float]:
     if member.problem.noise is not None:
         size = max(size, float(spread(cheapest)))
     return member.validation_loss, float(costs.mean()), float(cheapest.mean()), size
-
-
-def _mean_over_processes(value: float, member: Learner) -> float:
-    own = torch.tensor(value, dtype=torch.float64, device=member.problem.goal.device)
-    return float(mean_over_processes(own))
 
 
 def _copy_of(state: Mapping[str, Any]) -> dict[str, Any]:

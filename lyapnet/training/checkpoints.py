@@ -7,12 +7,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from lyapnet.base.errors import Interrupted
-from lyapnet.training.learner import mean_over_processes
+from lyapnet.training.learner import number_over_processes
 from lyapnet.training.modules import labelled
 from lyapnet.training.runs import TrainingRun
 
@@ -97,8 +96,7 @@ class Checkpoints(Checkpoint):
     def _save_best(self, trainer: Trainer, module: Any) -> None:
         _save_logs(trainer)
         for member in module.members:
-            own = torch.tensor(member.validation_loss, dtype=torch.float64, device=module.device)
-            loss = float(mean_over_processes(own))
+            loss = number_over_processes(member.validation_loss, module.device)
             if loss < self.best_loss[member.label]:
                 self.best_loss[member.label] = loss
                 module.save_member(member, self.best[member.label])

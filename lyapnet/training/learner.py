@@ -271,3 +271,8 @@ def mean_over_processes(value: Tensor) -> Tensor:
     total = value.clone()
     torch.distributed.all_reduce(total)
     return total / torch.distributed.get_world_size()
+
+
+def number_over_processes(value: float, device: torch.device) -> float:
+    """`mean_over_processes` of a Python number, in double precision."""
+    return float(mean_over_processes(torch.tensor(value, dtype=torch.float64, device=device)))

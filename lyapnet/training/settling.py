@@ -5,12 +5,11 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.experiment.config import Config
 from lyapnet.training.curves import members_of
-from lyapnet.training.learner import Learner, mean_over_processes
+from lyapnet.training.learner import Learner, number_over_processes
 from lyapnet.training.stage_messages import StageMessages
 
 WINDOW = 40  # steps in which the validation loss has to fall
@@ -79,8 +78,8 @@ class Settling(Callback):
 
     def _note_losses(self, step: int, module: LightningModule) -> None:
         for member in members_of(module):
-            loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=module.device)
-            self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
+            loss = number_over_processes(member.validation_loss, module.device)
+            self.losses.setdefault(member.label, []).append((step, loss))
 
     def _has_stopped(self, label: str, step: int) -> bool:
         losses = self.losses[label]

@@ -13,6 +13,7 @@ from lyapnet.training import best_weights
 from lyapnet.training.best_weights import COMPARED_SHARE, DIVERGENCE_COST_RATIO, RATE_DIVISOR, WORSE_BY
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
+from tests.training.small_runs import small_run
 
 STATES = 64
 MEASURE_ON = Learner.measure_on
@@ -20,22 +21,10 @@ MEASURE_ON = Learner.measure_on
 
 @pytest.fixture
 def config(tmp_path):
-    return {
-        "logs": str(tmp_path),
-        "experiment": "best",
-        "system": {"name": "double_integrator"},
-        "cost": {"Q": [1, 1], "R": [1], "Q_T": [1, 1]},
-        "initial_states": {"lower": [-1, -1], "upper": [1, 1]},
-        "horizon": {"steps": 8, "dt": 0.1},
-        "program": {"name": "value", "trajectory_cost": 1},
-        "network": {"name": "fcn", "hidden": [8]},
-        "rollout": {"gradient": "discrete", "compile": "off"},
-        "training": {
-            "iterations": 12, "batch_size": 4, "learning_rate": 0.01, "validate_every": 2, "least_gain": 1e-9,
-        },
-        "evaluation": {"figures_every": 1000, "optimum": False, "test_states": 4, "validation_states": STATES},
-        "loggers": ["csv"],
-    }  # fmt: skip
+    content = small_run(tmp_path, "best")
+    content["training"] |= {"validate_every": 2, "least_gain": 1e-9}
+    content["evaluation"] |= {"validation_states": STATES}
+    return content
 
 
 class Validations:

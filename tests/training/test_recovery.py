@@ -14,6 +14,7 @@ from lyapnet.training.best_weights import RATE_DIVISOR
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
 from lyapnet.training.recovery import MAX_RETURNS
+from tests.training.small_runs import small_run
 
 
 @pytest.fixture
@@ -23,20 +24,7 @@ def traced():
 
 @pytest.fixture
 def config(tmp_path):
-    return {
-        "logs": str(tmp_path),
-        "experiment": "recovery",
-        "system": {"name": "double_integrator"},
-        "cost": {"Q": [1, 1], "R": [1], "Q_T": [1, 1]},
-        "initial_states": {"lower": [-1, -1], "upper": [1, 1]},
-        "horizon": {"steps": 8, "dt": 0.1},
-        "program": {"name": "value", "trajectory_cost": 1},
-        "network": {"name": "fcn", "hidden": [8]},
-        "rollout": {"gradient": "discrete", "compile": "off"},
-        "training": {"iterations": 12, "batch_size": 4, "learning_rate": 0.01, "validate_every": 4},
-        "evaluation": {"figures_every": 1000, "optimum": False, "test_states": 4},
-        "loggers": ["csv"],
-    }
+    return small_run(tmp_path, "recovery")
 
 
 def run_of(config, capsys, **options):

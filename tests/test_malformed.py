@@ -308,6 +308,15 @@ certify sound CKPT --alpha 2
 certify sound CKPT --alpha nan
 certify sound CKPT --delta -1
 certify sound CKPT --delta inf
+certify sound CKPT --time sometimes
+certify sound CKPT --time continuous --jitter 0.1
+certify sound CKPT --interval 0
+certify sound CKPT --jitter -1
+certify sound CKPT --delay nan
+certify sound CKPT --measured position
+certify sound CKPT --measured place=0.1
+certify sound CKPT --measured position=-1
+certify region CKPT --quantised position=1
 certify sound CKPT --set=1,2
 certify sound CKPT --set=-inf:inf,-inf:inf
 certify sound CKPT --set=nan:nan,-1:1

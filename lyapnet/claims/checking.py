@@ -17,7 +17,7 @@ from lyapnet.base.types import State
 from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.funnel import prove_funnel
-from lyapnet.claims.kept_regions import kept_region
+from lyapnet.claims.kept_regions import kept_region, readings_in
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.noisy_certificate import NoisyCertificate
 from lyapnet.claims.noisy_funnel import prove_noisy_funnel
@@ -34,6 +34,7 @@ from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress
+from lyapnet.prover.readings import Readings
 from lyapnet.task.sets import Box
 
 UNLIMITED = 1e9  # seconds: a check ends when all leaves are bounded, so that it needs no budget
@@ -107,6 +108,7 @@ class KeptSide(NamedTuple):
     delta: float  # in cost per second
     states: Box  # D; of width 0 along ignorable states
     disturbance: State | None
+    readings: Readings | None
     degree: int  # of the Taylor forms
     rho: float
     seconds: float  # of the original search
@@ -127,23 +129,27 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
     content = part_of(read_proofs(path), name, path)
     with refusing(path):
         of = content["of"][0]
-        lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
+        readings = readings_in(of, controller.horizon.duration)
+        last = None if readings is None else -1  # the last axis is the age of a reading
+        lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:last] for side in ("lower", "upper"))
         w = None if of["disturbance"] is None else torch.tensor(of["disturbance"], dtype=torch.float64)
         if of["degree"] not in (2, DEGREE):
             raise ValueError("forms of unknown degree")
         kept = KeptSide(
-            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, int(of["degree"]),
+            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, readings, int(of["degree"]),
             float(content["proved"]), float(content["seconds"]),
         )  # fmt: skip
     loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
     if name == "below":
         condition = RiseCondition(loop, kept.alpha, kept.delta, problem)
     else:
-        condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance)
+        condition = DecreaseCondition(
+            loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance, kept.readings
+        )
     if kept.states.dimension == controller.system.n:  # otherwise the claim raises the error
         domain = over_time(kept.states, controller.horizon.duration)
-        of = about(bounded_condition(condition, domain, kept.degree), condition, *domain)
-        KeptProof(path, of, math.inf).claim(domain)
+        box = condition.search_box(domain)
+        KeptProof(path, about(bounded_condition(condition, domain, kept.degree), condition, *box), math.inf).claim(box)
     return kept
 
 
@@ -151,7 +157,7 @@ def _reprove_funnel(controller: Controller, path: Path, budget: Budget, report: 
     kept = kept_funnel(controller, path)
     claim = prove_funnel(
         controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
-        path, True, kept.degree, kept.disturbance,
+        path, True, kept.degree, kept.disturbance, kept.readings,
     )  # fmt: skip
     reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or the funnel misses some of X₀"
     return Checked(SoundCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, kept.seconds)
@@ -166,7 +172,8 @@ def _reprove_two_sides(controller: Controller, path: Path, budget: Budget, repor
         )
     loop, problem, numbers = controller.closed_loop, controller.problem, (above.alpha, above.delta)
     upper = prove_funnel(
-        loop, problem, *numbers, above.states, budget, _generator(), report, path, True, above.degree
+        loop, problem, *numbers, above.states, budget, _generator(), report, path, True, above.degree,
+        readings=above.readings,
     )  # fmt: skip
     lower = prove_lower_bound(loop, problem, *numbers, below.states, budget, _generator(), report, path, True)
     certificate = TwoSidedCertificate(
@@ -187,7 +194,7 @@ def _reprove_region(controller: Controller, path: Path, budget: Budget, report: 
     plants = plants_of(controller, kept.parameters) if kept.parameters else None
     claim = prove_region(
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
-        kept.disturbance, plants,
+        kept.disturbance, plants, kept.readings,
     )  # fmt: skip
     reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is above the level of the proof"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds

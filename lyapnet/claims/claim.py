@@ -211,6 +211,23 @@ def check_disturbance(value: Any) -> None:
         raise UsageError(f'Expected disturbance as numbers by name, got {value!r}; for example {{"velocity": 0.1}}.')
 
 
+def check_reading(value: Any) -> None:
+    """Refuse a value that is no name of a way to read a law."""
+    if value not in READ_AT:
+        raise UsageError(f"Expected time as {' or '.join(READ_AT)}, got {value!r}; name one of them.")
+
+
+READ_AT = ("continuous", "held")
+"""When u is read: at every t, or at times at most Δt apart, and held between them."""
+
+
+def check_errors(value: Any) -> None:
+    """Refuse a value that is not a mapping from names to finite numbers ≥ 0."""
+    usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(e) for n, e in value.items())
+    if not usable or not all(0 <= e < math.inf for e in value.values()):
+        raise UsageError(f'Expected errors as numbers ≥ 0 by name, got {value!r}; for example {{"velocity": 0.01}}.')
+
+
 def check_noise(value: Any) -> None:
     """Refuse a value that is not a mapping from names to numbers ≥ 0, one of them positive."""
     usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(s) for n, s in value.items())

@@ -34,6 +34,7 @@ from lyapnet.prover.condition import (
 )
 from lyapnet.prover.counterexamples import Counterexample, find_counterexample
 from lyapnet.prover.proof import Progress, Proof, prove, tell
+from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
@@ -66,6 +67,10 @@ class ProvedFunnel:
     are 0 holds on every slice. (Such a state cannot go to infinity in finite time: its derivative is bounded.)
     The parameters of a family are constant: along them D is their range, and no closed loop leaves it there.
 
+    With `readings` the law is not read at every t. Then the inequality holds at t = t̂ + a and x = x(t̂ + a) for the
+    control u of each reading at (t̂, x̂) with W(t̂, x̂) ≤ ρ, as long as it may be in use (see Readings). By induction over
+    the readings the same follows, whatever their times are.
+
     The verdict is about the funnel of ρ = `wanted`, which contains all of X₀. For every verdict, `rho` is the largest
     proved level, and {V(0, ·) ≤ rho} contains the share `volume_share` of X₀.
     """
@@ -93,6 +98,7 @@ class ProvedFunnel:
     disturbance: State | None = None  # w: the claim holds for all ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i
     set_up: float = 0.0  # seconds of the budget before the first box
     assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
+    readings: Readings | None = None  # when u is read; None: at every t
     formula: ClassVar[str] = "ρ + δt"  # of `level`, for figures
 
     def level(self, t: float) -> float:
@@ -139,6 +145,7 @@ def prove_funnel(
     replay: bool = False,
     degree: int = 2,
     disturbance: State | None = None,
+    readings: Readings | None = None,
 ) -> ProvedFunnel:
     """Prove the largest funnel that a budget allows, up to the one that contains X₀.
 
@@ -148,6 +155,7 @@ def prove_funnel(
         states: D; by default a box around {W ≤ max V(0, ·) on X₀}, estimated from samples.
         report, keep, replay, degree: as in prove.
         disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
+        readings: when u is read; None: at every t.
 
     Raises:
         UsageError: α, δ or D are unsuitable; or the closed loop has an operator without a bound.
@@ -157,7 +165,7 @@ def prove_funnel(
     if disturbance is not None:
         _require_usable_disturbance(disturbance, problem)
     condition = DecreaseCondition(
-        copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance
+        copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance, readings
     )
     duration = problem.horizon.duration
     left_out, initial_states, wanted, D, domain, sides, levels, assumed = find_setting(
@@ -177,7 +185,8 @@ def prove_funnel(
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed and budget.left:  # the proof went only up to a level below the one that X₀ needs
-        found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
+        bounded = bounded_condition(condition, domain, level=needed)
+        found = find_counterexample(condition, bounded, *condition.search_box(domain), needed, generator)
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
     share = 1.0 if rho >= wanted else share_of(condition.V, x_low, x_high, rho, budget)
     excess = terminal_excess(condition, D, duration, rho, budget)
@@ -188,6 +197,7 @@ def prove_funnel(
         remaining_volume=proof.remaining_volume, undecided=proof.undecided, left_out=left_out,
         fingerprint=proof.fingerprint, proof_seconds=proof.seconds, constraints=names, crossing=crossing,
         violation=violation, disturbance=disturbance, set_up=spent, assumed=assumed,
+        readings=readings,
     )  # fmt: skip
 
 

@@ -1,9 +1,10 @@
 """Reads the file of a region's proof: the numbers that are to be proved again."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import State
 from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
+from lyapnet.prover.readings import Readings
 from lyapnet.task.sets import Box
 
 NEW_FILE = "choose another file"
@@ -24,15 +26,18 @@ class KeptRegion(NamedTuple):
     decay: float  # λ in 1/s
     states: Box  # D; of width 0 along ignorable states
     parameters: dict[str, list[float]]  # the bounds of P by name; empty for one plant
-    contracting: tuple[Box, Tensor] | None  # (B, Y); None with a disturbance
+    contracting: tuple[Box, Tensor] | None  # (B, Y); None with a disturbance or readings
     disturbance: State | None  # w
+    readings: Readings | None  # when u is read; None: at every t
     hole: float  # c
     wanted: float  # the level up to which the proof searched
     rho: float  # the proved level, as recorded
     seconds: float  # of the search
 
-    def require(self, decay: float, disturbance: State | None, n: int, parameters: Sequence[str] = ()) -> None:
-        """Refuse λ, w or names of parameters that differ from those of the file.
+    def require(
+        self, decay: float, disturbance: State | None, n: int, parameters: Sequence[str], readings: Readings | None
+    ) -> None:
+        """Refuse λ, w, readings or names of parameters that differ from those of the file.
 
         Args:
             disturbance: w of n states, followed by zeros for parameters.
@@ -45,6 +50,8 @@ class KeptRegion(NamedTuple):
         kept, given = (None if w is None else w.tolist() for w in (self.disturbance, disturbance))
         if kept != (given and given[:n]):
             raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
+        if self.readings != (readings and replace(readings, errors=readings.errors[:n])):
+            raise UsageError(f"Expected the readings of {str(self.path)!r}, got others; {NEW_FILE}.")
 
     def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
         """Refuse D or P that differ from those of the file.
@@ -83,7 +90,11 @@ def kept_region(path: Path) -> KeptRegion:
     with refusing(path):
         of, wanted, _ = content["of"]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64) for side in ("lower", "upper"))
+        readings = readings_in(of, None)
+        if readings is not None:  # the last axis is the age of a reading
+            lower, upper = lower[:-1], upper[:-1]
         n = len(lower) - 1 - len(of.get("parameters", []))
+        readings = readings and replace(readings, errors=readings.errors[:n])
         ranges = _ranges(of.get("parameters", []), lower[1 + n :].tolist(), upper[1 + n :].tolist())
         numbers = of["decay"], of["hole"], wanted, content["proved"], content["seconds"]
         decay, hole, wanted, rho, seconds = (float(number) for number in numbers)
@@ -92,11 +103,33 @@ def kept_region(path: Path) -> KeptRegion:
             w = torch.tensor(of["disturbance"], dtype=torch.float64)[:n]
             if not bool((w > 0).any()):
                 raise ValueError("a disturbance of zeros")
-        else:
+        if "disturbance" not in of and readings is None:
             lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
             contracting = Box(lowest, highest), Y
         D = Box(lower[1 : 1 + n], upper[1 : 1 + n])
-        return KeptRegion(path, decay, D, ranges, contracting, w, hole, wanted, rho, seconds)
+        return KeptRegion(path, decay, D, ranges, contracting, w, readings, hole, wanted, rho, seconds)
+
+
+def readings_in(of: Mapping[str, Any], duration: float | None) -> Readings | None:
+    """When u is read, as a file says it; None: at every t.
+
+    Args:
+        duration: T; None for the receding law.
+
+    Raises:
+        ValueError: invalid numbers.
+    """
+    facts = of.get("readings")
+    if facts is None:
+        return None
+    found = Readings(
+        float(facts["interval"]), float(facts["delay"]), tuple(map(float, facts["errors"])),
+        tuple(map(float, facts["control_errors"])), duration,
+    )  # fmt: skip
+    numbers = [found.interval, found.delay, *found.errors, *found.control_errors]
+    if not found.interval > 0 or not all(0 <= number < math.inf for number in numbers):
+        raise ValueError("invalid readings")
+    return found
 
 
 def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:

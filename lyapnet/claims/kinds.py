@@ -13,8 +13,10 @@ from lyapnet.claims.claim import (
     Run,
     check_boxes,
     check_disturbance,
+    check_errors,
     check_noise,
     check_parameters,
+    check_reading,
     flag_of,
     is_same,
     option,
@@ -92,9 +94,35 @@ class Statistical(Claim):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Funnel(Claim):
+class ReadAtTimes(Claim):
+    """A claim about u read at every t, or at times and held between them, with a delay and errors."""
+
+    time: str | None = option(
+        None, "When u is read: continuous, at every t; or held, each Δt.", metavar="WHEN", check=check_reading
+    )  # fmt: skip
+    interval: float | None = option(
+        None, "Seconds between two readings of u; Δt if none.", above=0, remedy="give it in s"
+    )  # fmt: skip
+    jitter: float = option(
+        0.0, "Share of this time by which a reading may be later.", at_least=0, remedy="0.1 is 10 % of the interval"
+    )  # fmt: skip
+    delay: float = option(
+        0.0, "Seconds from a reading to the use of its control, at most.", at_least=0, remedy="give it in s"
+    )  # fmt: skip
+    measured: Mapping[str, float] | None = option(
+        None, "The largest error of a state where it is read; may be given again.", metavar="STATE=E",
+        check=check_errors,
+    )  # fmt: skip
+    quantised: Mapping[str, float] | None = option(
+        None, "The step to which a control is rounded; may be given again.", metavar="CONTROL=STEP", check=check_errors
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Funnel(ReadAtTimes):
     """A funnel that no closed loop leaves up to T, and a bound of the cost from each state in it: proved.
 
+    Without `time` it is about a held law if the law is made to be held and there are no state constraints.
     lyapnet.claims.funnel.ProvedFunnel states the conditions.
     """
 
@@ -115,17 +143,19 @@ class Funnel(Claim):
         require_known_minimum(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, disturbance_of, slack_of
+        from lyapnet.claims.arguments import box_of, disturbance_of, readings_of, slack_of
         from lyapnet.claims.funnel import prove_funnel
         from lyapnet.claims.least_cost import DEGREE
         from lyapnet.claims.preconditions import require_goal
         from lyapnet.claims.sound_certificate import SoundCertificate
 
         require_goal(controller.problem, self.kind)
+        held = controller.closed_loop.policy.held and controller.problem.constraints is None
         found = prove_funnel(
             controller.closed_loop, controller.problem, self.alpha, slack_of(self.delta, controller),
             box_of(self.states), run.budget, run.generator, run.report, run.keep, degree=DEGREE if run.two_sided else 2,
             disturbance=disturbance_of(self.disturbance, controller),
+            readings=readings_of(self, controller, "held" if held else "continuous"),
         )  # fmt: skip
         return SoundCertificate(controller, found, run.options(self))
 
@@ -230,11 +260,12 @@ class Reach(Claim):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Region(Claim):
+class Region(ReadAtTimes):
     """A region of attraction of the receding law u(0, x), for all times: proved.
 
     With a disturbance, it is a set that no closed loop leaves, and a smaller set that each closed loop enters and never
     leaves. With parameters, it holds for every plant whose constant parameters lie in the given intervals.
+    Without `time` u is read at every t.
     lyapnet.claims.region.ProvedRegion states the conditions.
     """
 
@@ -256,7 +287,7 @@ class Region(Claim):
         require_written_law(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, disturbance_of
+        from lyapnet.claims.arguments import box_of, disturbance_of, readings_of
         from lyapnet.claims.plants import plants_of
         from lyapnet.claims.region import prove_region
         from lyapnet.claims.region_certificate import RegionCertificate
@@ -265,6 +296,7 @@ class Region(Claim):
             controller.closed_loop, controller.problem, self.decay, box_of(self.states), run.budget, run.generator,
             run.report, run.keep, disturbance=disturbance_of(self.disturbance, controller),
             plants=plants_of(controller, self.parameters) if self.parameters else None,
+            readings=readings_of(self, controller, "continuous", forever=True),
         )  # fmt: skip
         return RegionCertificate(controller, found, run.options(self))
 

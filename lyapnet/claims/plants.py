@@ -3,7 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.experiment.assembly.classes import float64_defaults, section
 from lyapnet.loop.random_plants import NominalLaw
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.readings import Readings
 from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_constant_states
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
@@ -59,6 +60,10 @@ class Plants:
     def disturbance_of_all(self, w: Tensor) -> Tensor:
         """A disturbance w of ẋ as one of ż, with zeros for ṗ."""
         return torch.cat([w, w.new_zeros(self.box.dimension)])
+
+    def readings_of_all(self, readings: Readings) -> Readings:
+        """Readings of x as those of z, without errors of p."""
+        return replace(readings, errors=(*readings.errors, *[0.0] * self.box.dimension))
 
     def all_of(self, loop: ClosedLoop, problem: Problem) -> tuple[ClosedLoop, Problem]:
         """The closed loop of all plants in z and its problem, from those of the nominal plant."""

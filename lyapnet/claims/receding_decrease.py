@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import PerState, State, Time
+from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.claims.contraction import Contraction
 from lyapnet.claims.kept_regions import REMEDY
 from lyapnet.claims.preconditions import append_constants, over_time
@@ -17,6 +17,7 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_below, minimum
 from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.readings import Readings
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 
@@ -28,6 +29,7 @@ class RecedingDecrease(DecreaseCondition):
 
     Args:
         parameters: names of the constants of the system, on which neither V nor u depends.
+        readings: how u(0, x) is read and held; None: it is read at every t.
     """
 
     proves, partial = "region", True
@@ -38,8 +40,9 @@ class RecedingDecrease(DecreaseCondition):
         decay: float,
         disturbance: State | None = None,
         parameters: Sequence[str] = (),
+        readings: Readings | None = None,
     ):
-        super().__init__(closed_loop, 1.0, 0.0, disturbance=disturbance)
+        super().__init__(closed_loop, 1.0, 0.0, disturbance=disturbance, readings=readings)
         if not 0 < decay < math.inf:
             raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
         self.decay, self.hole, self.around, self.parameter_names = decay, 0.0, None, list(parameters)
@@ -50,7 +53,9 @@ class RecedingDecrease(DecreaseCondition):
         hole = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
         disturbance = {} if w is None else {"disturbance": w.tolist()}
         parameters = {"parameters": self.parameter_names} if self.parameter_names else {}
-        return {"decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters}
+        return {
+            "decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters, **self.facts_of_readings
+        }  # fmt: skip
 
     def open_hole(
         self,
@@ -76,12 +81,16 @@ class RecedingDecrease(DecreaseCondition):
         self.constraints = OutsideTheHole(self.V, around.box, self.hole)
 
     def open_everywhere(self, level: float) -> None:
-        """Exclude {x ∈ D: V < c} from the condition, where disturbances may increase V."""
+        """Exclude {x ∈ D: V < c} from the condition, where disturbances or a held control may increase V."""
         self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
+        return self.parts_under(t, x, self.closed_loop.policy(t, x))
+
+    def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
+        t = torch.zeros_like(t)  # V(0, ·), also after a reading
         value, slope = self.V.value_and_state_gradient(t, x)
-        rate = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
+        rate = (slope * self.closed_loop.system.dynamics(x, u)).sum(-1)
         if self.disturbance is not None:
             rate = rate + self.worst_push(slope)
         return rate + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), rate

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -32,6 +32,7 @@ from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, mini
 from lyapnet.prover.condition import own_constraints
 from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.proof import Progress, Proof
+from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
 from lyapnet.task.constraints import Constraints, names_of
 from lyapnet.task.problem import Problem
@@ -67,6 +68,10 @@ class ProvedRegion:
     {x ∈ D: V(x) ≤ c} within ln(ρ/c)/λ, and stays there: practical stability, with c as the ultimate bound. Convergence
     to the goal or to an equilibrium is not claimed. {x ∈ D: V(x) ≤ c} lies in the box `extent`.
 
+    With readings, u(0, x) is not read at every t, and the inequality holds for the control of each reading at x̂ ∈ D
+    with V(x̂) ≤ ρ, as long as it may be in use (see Readings). Since a held control need not let V fall near the goal,
+    the hole and what follows are as with a disturbance, which may be 0.
+
     With plants, all of this holds for ẋ = F(x; p) with every constant p in a box P, where u and V depend on x alone.
     The region is the same for all p; each p has its own equilibrium, in the hole.
 
@@ -101,6 +106,12 @@ class ProvedRegion:
     set_up: float = 0.0  # seconds of the budget before the first box
     precision: str | None = None  # the number type in which u is computed; None for real numbers
     distance_left: float = math.nan  # a bound of the distance from the goal as t → ∞, if u is rounded
+    readings: Readings | None = None  # when u is read; None: at every t
+
+    @property
+    def practical(self) -> bool:
+        """Whether the claim is practical stability: closed loops enter {V ≤ c}, and stay there."""
+        return self.disturbance is not None or self.readings is not None
 
     @property
     def entered_within(self) -> float:
@@ -148,10 +159,10 @@ class ProvedRegion:
     @property
     def _reason_without_hole(self) -> str | None:
         """The reason why there is no hole; None if there is one."""
-        if self.disturbance is not None:
+        if self.practical:
             return None if self.hole > 0 else (
-                "no levels c < ρ were found between which V(0, ·) falls under every disturbance: choose a smaller "
-                f"disturbance, or a smaller decay{self._or_narrow}"
+                f"no levels c < ρ were found between which V(0, ·) falls under every {self._smaller}: choose a smaller "
+                f"one, or a smaller decay{self._or_narrow}"
             )  # fmt: skip
         plants = "" if self.plants is None else " of all plants"
         if self.contraction is None and not self.slowest < 0:
@@ -172,10 +183,10 @@ class ProvedRegion:
     @property
     def _reason_of_size(self) -> str:
         """The reason why the region does not contain X₀."""
-        if self.verdict == "falsified" and self.disturbance is not None:
+        if self.verdict == "falsified" and self.practical:
             return (
-                "V(0, ·) does not fall at the rate λ there, at a level above c, under the worst disturbance: choose a "
-                f"smaller disturbance, or a smaller decay{self._or_narrow}"
+                f"V(0, ·) does not fall at the rate λ there, at a level above c, under the worst {self._smaller}: "
+                f"choose a smaller one, or a smaller decay{self._or_narrow}"
             )
         if self.verdict == "falsified":
             return (
@@ -187,6 +198,11 @@ class ProvedRegion:
         if self.rim <= self.wanted:
             return "the bounds do not separate the region from the boundary of D or a constraint: choose a larger set"
         return "V(0, ·) does not fall close to the level that X₀ needs"
+
+    @property
+    def _smaller(self) -> str:
+        """What a region could have less of."""
+        return "disturbance" if self.readings is None else "age and error of a reading"
 
     @property
     def _or_narrow(self) -> str:
@@ -208,12 +224,14 @@ class ProvedRegion:
         return math.prod(w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out)
 
 
-def _read_kept(file: Path | None, decay: float, w: State | None, n: int, names: Sequence[str]) -> KeptRegion | None:
+def _read_kept(
+    file: Path | None, decay: float, w: State | None, n: int, names: Sequence[str], readings: Readings | None
+) -> KeptRegion | None:
     """The numbers in the file of the same claim; None if the file does not exist yet."""
     if file is None or not file.exists():
         return None
     kept = kept_region(file)
-    kept.require(decay, w, n, names)
+    kept.require(decay, w, n, names, readings)
     return kept
 
 
@@ -229,6 +247,7 @@ def prove_region(
     replay: bool = False,
     disturbance: State | None = None,
     plants: Plants | None = None,
+    readings: Readings | None = None,
 ) -> ProvedRegion:
     """Prove the largest sublevel set of V(0, ·) that a budget allows as a region of attraction of the receding law.
 
@@ -240,6 +259,7 @@ def prove_region(
         report, keep, replay: as in prove. If the file exists, B, Y, c and ρ are read from it and proved again.
         disturbance: w, (n,): the claim is about every ẋ = F + w(t) with |w_i(t)| ≤ w_i; w = 0 is no disturbance.
         plants: the claim is about each of these plants under the law and V of the nominal plant.
+        readings: when u is read; None: at every t.
 
     Raises:
         UsageError: λ, w or D are unsuitable, the system is a family, an operator has no bound, or the file has another
@@ -255,8 +275,10 @@ def prove_region(
     if plants is not None:
         loop, problem = plants.all_of(loop, problem)
         states, w = states and plants.around(states), None if w is None else plants.disturbance_of_all(w)
-    condition = RecedingDecrease(loop, decay, w, names)
-    goal, kept = problem.goal.double(), _read_kept(keep, decay, w, n, names)
+        readings = readings and plants.readings_of_all(readings)
+    practical = w is not None or readings is not None
+    condition = RecedingDecrease(loop, decay, w, names, readings)
+    goal, kept = problem.goal.double(), _read_kept(keep, decay, w, n, names, readings)
     setting = find_setting(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
@@ -269,7 +291,7 @@ def prove_region(
         options = {"generator": generator, "report": report, "keep": keep, "replay": replay}
         proof = prove_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
-    extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _ultimate_set(condition, D, n, budget)
+    extent, ultimate = (None, math.nan) if not practical or rho == -math.inf else _ultimate_set(condition, D, n, budget)
     precision, distance = _rounding(loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return ProvedRegion(
@@ -279,6 +301,7 @@ def prove_region(
         seconds=time.monotonic() - started, left_out=left_out, constraints=names_of(problem.constraints),
         disturbance=None if w is None else w[:n], extent=extent, ultimate_share=ultimate, plants=plants, set_up=set_up,
         precision=precision, distance_left=distance,
+        readings=readings and replace(readings, errors=readings.errors[:n]),
     )  # fmt: skip
 
 
@@ -318,14 +341,14 @@ def _open_hole(
     budget: Budget,
     kept: KeptRegion | None,
 ) -> tuple[Contraction | None, float, float]:
-    """Open the hole: on the box where the law contracts, or as large as the disturbance requires; or that of a file.
+    """Open the hole: where the law contracts, or as large as disturbances and readings require; or that of a file.
 
     Returns:
         (the contraction, the largest real part of the linearised law's eigenvalues, the level up to which to prove).
-        With a disturbance the first two are None and nan.
+        With a disturbance or readings the first two are None and nan.
     """
     levels = budget_for_level(budget)
-    if condition.disturbance is not None:
+    if condition.disturbance is not None or condition.readings is not None:
         level = just_below(rim) if kept is None else kept.level(True, rim)
         hole = ultimate_level(condition, setting.domain, goal, level, levels) if kept is None else kept.hole
         condition.open_everywhere(hole)

@@ -15,10 +15,14 @@ from lyapnet.claims import figures
 from lyapnet.claims.certificates import (
     FROZEN,
     NOT_PROVED,
+    READINGS,
     Certificate,
+    control_of,
     disturbance_text,
     format_state,
     named_disturbance,
+    readings_facts,
+    readings_text,
 )
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
@@ -34,7 +38,7 @@ PATHS, EDGE = 16, 0.03  # number of closed loops to draw; they begin where 1 −
 
 class RegionCertificate(Certificate):
     """A set that no closed loop of the receding law leaves and from which all converge to one equilibrium. With a
-    disturbance, all enter a smaller set around the goal, which none leaves.
+    disturbance, or where u is held, all enter a smaller set around the goal, which none leaves.
     """
 
     kind: str = "region"
@@ -53,6 +57,7 @@ class RegionCertificate(Certificate):
         "parameters": "parameters of the plant, constant, anywhere in",
         "nominal_parameters": "those that V and u were made for",
         "disturbance": "disturbances, at most",
+        **READINGS,
         "ultimate_level": "c, V(0, ·) from some time on, at most",
         "ultimate_volume": "volume of {V(0, ·) ≤ c}, at most",
         "ultimate_extent": "box around {V(0, ·) ≤ c}",
@@ -81,10 +86,11 @@ class RegionCertificate(Certificate):
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, {0} × D, and the level up to which it was to be proved."""
         claim = self.claim
-        loop, states, w = self._loop, claim.states, claim.disturbance
+        loop, states, w, readings = self._loop, claim.states, claim.disturbance, claim.readings
         if claim.plants is not None:
             states, w = claim.plants.around(states), None if w is None else claim.plants.disturbance_of_all(w)
-        condition = RecedingDecrease(loop, claim.decay, w)
+            readings = readings and claim.plants.readings_of_all(readings)
+        condition = RecedingDecrease(loop, claim.decay, w, readings=readings)
         if claim.hole > 0:
             around = None if claim.contraction is None else claim.contraction.box
             condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
@@ -106,6 +112,7 @@ class RegionCertificate(Certificate):
         }  # fmt: skip
         plants = claim.plants
         further = {} if claim.disturbance is None else {"disturbance": self.disturbance}
+        further |= readings_facts(claim.readings, self.controller.system)
         if plants is not None:
             further |= {"parameters": plants.ranges, "nominal_parameters": dict(plants.nominal)}
         if claim.extent is not None:
@@ -127,7 +134,8 @@ class RegionCertificate(Certificate):
             "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
             "constraints": list(claim.constraints) if proved else [],
             "counterexample": found and {
-                "x": found.x, **claim.failing_plant, "condition": found.condition, "V": found.height
+                "x": found.x, **claim.failing_plant, "condition": found.condition, "V": found.height,
+                **({} if claim.readings is None else {"after": found.after}),
             },
             "seconds": claim.seconds, **contraction, **further, **search,
             **({"origin": self._origin} if self._origin else {}),
@@ -169,17 +177,19 @@ class RegionCertificate(Certificate):
                     f"t → ∞, for every rounding of the operations of u in {claim.precision}"
                 )
             return (
-                f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants}: no "
-                f"closed loop that starts in it leaves it{kept}, and {end}."
+                f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants} with u "
+                f"read at every t: no closed loop that starts in it leaves it{kept}, and {end}."
             )
         assert claim.extent is not None
-        names, disturbances = self.controller.system.state_names, disturbance_text(self.disturbance)
+        names, system = self.controller.system.state_names, self.controller.system
+        under = f", {disturbance_text(self.disturbance)}" if self.disturbance else ""
         lower, upper = (side.tolist() for side in (claim.extent.lower, claim.extent.upper))
         seen = [i for i in range(len(names)) if i not in claim.left_out]
         within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
         return (
-            f"is invariant under the receding law u(0, x), proved in continuous time {plants}, {disturbances}: no "
-            f"closed loop that starts in it leaves it{kept}, and each enters {{x ∈ D: V(0, x) ≤ c}}, c = "
+            f"is invariant under the receding law u(0, x), proved in continuous time {plants}"
+            f"{under}, {readings_text(claim.readings, system)}: no closed loop that starts in it leaves it{kept}, and "
+            f"each enters {{x ∈ D: V(0, x) ≤ c}}, c = "
             f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
             f"ultimate bound). That set lies in {within}. Convergence to the goal or to rest is not claimed."
         )
@@ -213,12 +223,19 @@ class RegionCertificate(Certificate):
         rounded = ""
         if claim.precision is not None:
             rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
-        if self.disturbance:
+        if claim.practical:
             c = repr(claim.hole) if claim.hole > 0 else "c"
-            w = ", ".join(f"w({name}) = {w!r}" for name, w in self.disturbance.items())
+            pushed = "".join(f", w({name}) = {w!r}" for name, w in self.disturbance.items())
+            used, where = "u = u(0, x)", f"at each x ∈ D with {c} ≤ V ≤ {rho}"
+            if claim.readings is not None:
+                used = f"u = {control_of(claim.readings, 'u(0, x̂{})')}"
+                where = (
+                    f"at each x = x(t̂ + a) with V ≥ {c}, 0 ≤ a ≤ {claim.readings.longest!r}, after each reading x̂ ∈ D "
+                    f"with V(x̂) ≤ {rho}"
+                )
             return [
-                f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
-                f"at each x ∈ D with {c} ≤ V ≤ {rho}{plants}{rounded}",
+                f"V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if pushed else ''} ≤ −{claim.decay!r} max(V, {c})  with "
+                f"V = V(0, x), {used}{pushed}, {where}{plants}{rounded}",
                 inside,
             ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
@@ -237,12 +254,15 @@ class RegionCertificate(Certificate):
         why = {
             "certified": "it does",
             "falsified": "V does not fall so in the sublevel set around X₀ "
-            f"(closed loops may still {'stay in it' if self.disturbance else 'go to the goal'})",
+            f"(closed loops may still {'stay in it' if self.claim.practical else 'go to the goal'})",
             "unknown": self.claim.reason,
         }[self.verdict]
         plant = "".join(f", {name} = {value:.6g}" for name, value in self.claim.failing_plant.items())
-        where = "" if found is None else f" At x = {format_state(found.x)}{plant} it fails by {found.condition:.3g}."
-        but = f" but for {{V < {self.claim.hole!r}}}" if self.disturbance and self.claim.hole > 0 else ""
+        where = ""
+        if found is not None:
+            after = "" if self.claim.readings is None else f", {found.after:.3g} s after a reading there,"
+            where = f" At x = {format_state(found.x)}{plant}{after} it fails by {found.condition:.3g}."
+        but = f" but for {{V < {self.claim.hole!r}}}" if self.claim.practical and self.claim.hole > 0 else ""
         return f"The verdict is on the claim that a sublevel set on which V falls so{but} contains X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:

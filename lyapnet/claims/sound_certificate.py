@@ -9,7 +9,17 @@ from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import Corner
 from lyapnet.claims import figures
 from lyapnet.claims.arguments import COMPARED
-from lyapnet.claims.certificates import FROZEN, NOT_PROVED, disturbance_text, format_state, named_disturbance
+from lyapnet.claims.certificates import (
+    FROZEN,
+    NOT_PROVED,
+    READINGS,
+    control_of,
+    disturbance_text,
+    format_state,
+    named_disturbance,
+    readings_facts,
+    readings_text,
+)
 from lyapnet.claims.costs import CostCertificate, Inside
 from lyapnet.claims.funnel import ProvedFunnel
 from lyapnet.claims.least_cost import ProvedLowerBound
@@ -29,6 +39,7 @@ class SoundCertificate(CostCertificate):
         "alpha": "α",
         "delta": "δ, cost per second",
         "disturbance": "disturbances, at most",
+        **READINGS,
         "set": "D",
         "states_left_out": "states that nothing depends on",
         "rho_wanted": "ρ for all of X₀",
@@ -56,7 +67,9 @@ class SoundCertificate(CostCertificate):
         """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop = copied(self.controller.closed_loop)
-        condition = DecreaseCondition(loop, claim.alpha, claim.delta, disturbance=claim.disturbance)
+        condition = DecreaseCondition(
+            loop, claim.alpha, claim.delta, disturbance=claim.disturbance, readings=claim.readings
+        )
         return condition, over_time(claim.states, claim.duration), claim.wanted
 
     @cached_property
@@ -81,7 +94,7 @@ class SoundCertificate(CostCertificate):
             "terminal_excess": claim.terminal_excess if claim.volume_share else None, "reason": claim.reason,
             "boxes": claim.boxes, "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
             "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
-            "fingerprint": claim.fingerprint, **constraints,
+            "fingerprint": claim.fingerprint, **constraints, **readings_facts(claim.readings, self.controller.system),
         }  # fmt: skip
 
     @property
@@ -95,7 +108,8 @@ class SoundCertificate(CostCertificate):
             return NOT_PROVED
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
-            f"model: no closed loop that starts in it leaves the funnel, or D,{self._or_violates} up to "
+            f"model {readings_text(claim.readings, self.controller.system)}: no closed loop that starts in it leaves "
+            f"the funnel, or D,{self._or_violates} up to "
             f"T = {claim.duration:g} s, {self._under_disturbances}and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. It is about the traced operations of f, g, ℓ, V and u, "
             f"which have this fingerprint; {FROZEN}{self.parameters_text}"
@@ -118,9 +132,16 @@ class SoundCertificate(CostCertificate):
         alpha, delta, T = (f"{value!r}".removesuffix(".0") for value in (claim.alpha, claim.delta, claim.duration))
         rho, kappa = (repr(claim.rho), repr(claim.terminal_excess)) if claim.volume_share else ("ρ", "κ")
         h = ("  and  h(x) ≤ 0", "  and  h(x(t)) ≤ 0", "  and  h(x₀) ≤ 0") if self.claim.constraints else [""] * 3
+        where = f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{h[0]}"
+        if claim.readings is not None:
+            longest = f"{claim.readings.longest!r}"
+            where = (
+                f"with u = {control_of(claim.readings, 'policy(t̂, x̂{})')} at (t̂ + a, x(t̂ + a)), 0 ≤ a ≤ {longest}, "
+                f"t̂ + a ≤ {T}, after each reading (t̂, x̂) ∈ [0, {T}] × D with V(t̂, x̂) ≤ {rho} + {delta} t̂"
+            )
         return [
             f"V_t + V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if self.disturbance else ''} + {alpha} ℓ(x, u) ≤ {delta}  "
-            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{h[0]}",
+            f"{where}",
             f"V(t, x(t)) ≤ {rho} + {delta} t{h[1]}  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}{h[2]}",
             f"J(x₀) ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
         ]
@@ -140,7 +161,8 @@ class SoundCertificate(CostCertificate):
         }[self.verdict]
         where = ""
         if found is not None:
-            where = f" At t = {found.t:.6g} s, x = {format_state(found.x)} it fails by {found.condition:.3g}."
+            after = "" if self.claim.readings is None else f" read there, {found.after:.3g} s later"
+            where = f" At t = {found.t:.6g} s, x = {format_state(found.x)}{after} it fails by {found.condition:.3g}."
         return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
 
     def in_short(self, lower: ProvedLowerBound) -> str:

@@ -1,20 +1,24 @@
 """The ultimate bound under disturbances: the level above which V falls under every disturbance."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from lyapnet.base.types import Corner, PerState, State, Time, Value
+from lyapnet.base.types import Corner, Corners, PerState, State, Time, Value
 from lyapnet.claims.preconditions import at_time
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounds import BoundedFunction, Bounds
 from lyapnet.prover.boxes import Boxes, pieces, single
 from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, minimum, searched
-from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.condition import DecreaseCondition, bounded_condition
+from lyapnet.prover.taylor import TaylorForm, negate, shift
 from lyapnet.task.sets import Box
 
 SAMPLES, SCALES = 5_000, 10  # samples in each box, and number of boxes around the goal, each half as large
 ROOM = 0.01  # relative margin above the highest level at which V may rise, and around a hull, where bounds are too wide
+ROOM_IN_USE = 0.3  # the same where u is held: while a control is in use V may rise by so much
+BOXES = 30_000  # boxes for the highest level at which V may rise after a reading
 FEW = 0.003  # a smaller share of D between two levels may be due to chance
 PIECES = 16  # pieces into which the box of the constants is cut, about
 LEAST = 1e-6  # the smallest c, as a share of the middle level
@@ -23,13 +27,13 @@ LEAST = 1e-6  # the smallest c, as a share of the middle level
 def ultimate_level(
     condition: DecreaseCondition, domain: tuple[Corner, Corner], goal: State, level: float, budget: Budget
 ) -> float:
-    """An estimate of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ, plus 1 %; 0 if none is found.
+    """An estimate of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ, with some room; 0 if none is found.
 
     Samples give two levels between which the condition seems to hold. Below the middle of these, the highest V at which
     the condition may fail is bounded from above, on pieces of the constants' box. The result is not a proof.
 
     Args:
-        condition: V̇ + λV, at V > 0.
+        condition: V̇ + λV, at V > 0; for all readings, where u is held.
         domain: {0} × D, extended by the box of the constants.
         level: the highest ρ.
     """
@@ -37,15 +41,45 @@ def ultimate_level(
     between = _levels_of_fall(condition, domain, goal, level, constants)
     if between is None:
         return 0.0
-    V, middle = condition.V, sum(between) / 2
+    middle, bounded = sum(between) / 2, None
+
+    def value(t: Time, x: State) -> PerState:
+        return condition.values(torch.cat([t[..., None], x], -1))[1] if condition.readings else condition.V(t, x)
 
     def possible(t: Time, x: State) -> PerState:
         """At most 0 where V ≤ middle and the condition is ≥ 0."""
-        return torch.maximum(-condition(t, x), V(t, x) - middle)
+        c = condition.values(torch.cat([t[..., None], x], -1))[0] if condition.readings else condition(t, x)
+        return torch.maximum(-c, value(t, x) - middle)
 
-    lower, upper = pieces(*domain, [1 + i for i in constants], PIECES)
-    highest = -minimum(lambda t, x: -V(t, x), lower, upper, budget, possible, 0.0)
-    return min(middle, max((1 + ROOM) * highest, LEAST * middle))
+    room = ROOM
+    if condition.readings is not None:
+        room, budget = ROOM_IN_USE, replace(budget, boxes=BOXES)
+        bounded = _PossibleRise(bounded_condition(condition, domain, level=level), middle)
+    lower, upper = pieces(*condition.search_box(domain), [1 + i for i in constants], PIECES)
+    highest = -minimum(lambda t, x: -value(t, x), lower, upper, budget, possible, 0.0, bounded=bounded)
+    return min(middle, max((1 + room) * highest, LEAST * middle))
+
+
+class _PossibleRise(Bounds):
+    """Bounds of −V, and of a function that is at most 0 wherever V ≤ middle and a condition may be ≥ 0."""
+
+    def __init__(self, condition: Bounds, middle: float):
+        self.condition, self.middle, self.degree = condition, middle, condition.degree
+
+    def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
+        c, V, *_ = self.condition.forms(lower, upper)
+        above = V.interval()[0] > self.middle
+        rises = shift(V, V.center.new_tensor(-self.middle))
+        either = (torch.where(above, one, other) for one, other in ((rises.terms, -c.terms), (rises.radius, c.radius)))
+        return [negate(V), c.with_parts(*either)]
+
+    def on(self, device: torch.device) -> "_PossibleRise":
+        """The same, for boxes on another device."""
+        return _PossibleRise(self.condition.on(device), self.middle)
+
+    @property
+    def fingerprint(self) -> str:
+        return self.condition.fingerprint
 
 
 def _levels_of_fall(
@@ -57,9 +91,12 @@ def _levels_of_fall(
 ) -> tuple[float, float] | None:
     """The two levels with the most volume of D between them such that V falls at all samples there, or None."""
     x, weight = _samples(*domain, goal, constants)
+    points = torch.cat([x.new_zeros(len(x), 1), x], -1)
+    if condition.readings is not None:  # at the end of the use of each control
+        points = torch.cat([points, x.new_ones(len(x), 1)], -1)
     with torch.no_grad():
-        t = x.new_zeros(len(x))
-        value, falls = condition.height(t, x), condition(t, x) < 0
+        c, value = condition.values(points)
+        falls = c < 0
     within = (value > 0) & (value < level)
     rises = torch.cat([value.new_tensor([0.0, level]), value[within & ~falls]]).sort().values
     shares = value.new_zeros(len(rises) + 1)

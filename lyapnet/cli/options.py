@@ -289,6 +289,8 @@ READ: dict[str, tuple[bool, Callable[[Any], Any]]] = {
     "states": (False, read_set), "target": (False, partial(read_set, name="target")),
     "avoid": (True, lambda texts: [read_set(text, "avoid") for text in texts]), "disturbance": (True, read_pushes),
     "noise": (True, partial(read_pushes, option="--noise STATE=SIGMA")), "parameters": (True, read_intervals),
+    "time": (False, str), "measured": (True, partial(read_pushes, option="--measured STATE=E")),
+    "quantised": (True, partial(read_pushes, option="--quantised CONTROL=STEP")),
 }  # fmt: skip
 """A field that is no number ↦ whether its option may be given again, and how its text is read."""
 

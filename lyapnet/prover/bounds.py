@@ -13,6 +13,7 @@ also refuses bounds of another shape than the trace recorded.
 
 import copy
 import hashlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -39,7 +40,26 @@ MANY = 4000  # boxes; bounding them by torch takes as long as compiling a kernel
 TRACE_POINTS = 32  # points of the box at which the trace is compared with the function
 
 
-class BoundedFunction:
+class Bounds(ABC):
+    """Bounds of tensors that depend on (t, x), on boxes of (t, x), as searches need them."""
+
+    degree: int
+
+    @abstractmethod
+    def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
+        """The tensors on boxes, (boxes, axes) each, as Taylor forms in the coordinates of the box."""
+
+    @abstractmethod
+    def on(self, device: torch.device) -> "Bounds":
+        """The same, for boxes on another device."""
+
+    @property
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """A hash of all that is bounded."""
+
+
+class BoundedFunction(Bounds):
     """A function (t, x) ↦ tensors, with bounds of each entry on boxes of (t, x).
 
     Args:

@@ -16,7 +16,7 @@ from torch import Tensor
 from lyapnet.base.devices import require_device
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Corner, Corners, PerBox, Value
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounds import BoundedFunction, Bounds
 from lyapnet.prover.boxes import Boxes, CutTree, roots, single
 from lyapnet.prover.stopping import Stop
 from lyapnet.prover.taylor import TaylorForm, wide_axes
@@ -165,7 +165,7 @@ def searched(question: Question, frontier: Boxes, budget: Budget) -> Search:
 PROBES = 12  # boxes of a chunk on which a cut across every axis is tried
 
 
-def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor, result: int = 0) -> Tensor:
+def axis_to_cut(bounded: Bounds, form: TaylorForm, boxes: Boxes, chosen: Tensor, result: int = 0) -> Tensor:
     """For each chosen box, the axis whose cut lowers the excess of one result most.
 
     The linear part of a form is bounded exactly on any box; only the excess can prevent the proof of a true inequality.
@@ -185,10 +185,11 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
     lower, upper, *_ = probes.halves(axes.repeat(len(some)))
     halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[result].excess
     drop = excess[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
-    m = (drop.clamp_min(0) / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
-    # small terms decide between axes of equal excess: the linear part, then the widths
+    drop = drop.clamp_min(0) / drop.amax(-1, keepdim=True).clamp_min(1e-300)  # of each probe alike, however wide
+    m = (drop / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
+    # small terms decide between axes of equal excess: the linear part where it is finite, then the widths
     tie = 1e-12 * widths
-    tie[:, wide_axes(boxes.lower, boxes.upper)] += 1e-3 * form.coefficients.abs().T.nan_to_num()
+    tie[:, wide_axes(boxes.lower, boxes.upper)] += 1e-3 * form.coefficients.abs().T.nan_to_num(posinf=0.0)
     return torch.where(widths > 0, m * widths**2 + tie, -1.0)[chosen].argmax(-1)
 
 
@@ -201,7 +202,7 @@ class LeastValue(Question):
 
     function: Value
     where: Value
-    bounded: BoundedFunction  # of (f, where)
+    bounded: Bounds  # of (f, where)
     level: float
     enough: float
     unit: float
@@ -242,7 +243,7 @@ def minimum(
     enough: float = float("inf"),
     unit: float = 0.0,
     tolerance: float = 1e-3,
-    bounded: BoundedFunction | None = None,
+    bounded: Bounds | None = None,
 ) -> float:
     """A lower bound of min f over the points of boxes with where(t, x) ≤ level; ∞ if there are none.
 
@@ -268,7 +269,7 @@ def minimum(
 class ShareBelow(Question):
     """A lower bound of the share of a box, by volume, on which V ≤ level: the boxes with an upper bound ≤ level."""
 
-    bounded: BoundedFunction  # of V
+    bounded: Bounds  # of V
     lower: Corner
     upper: Corner
     level: float

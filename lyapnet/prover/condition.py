@@ -1,5 +1,6 @@
 """The condition that a sound certificate proves, as a function of (t, x)."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -7,9 +8,11 @@ from jaxtyping import Bool
 from torch import Tensor, nn
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import Corner, PerState, State, Time
+from lyapnet.base.types import Control, Corner, PerState, Points, State, Time
 from lyapnet.loop.rollout import ClosedLoop
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounded_readings import BoundedReadings
+from lyapnet.prover.bounds import BoundedFunction, Bounds
+from lyapnet.prover.readings import Readings, Run, simulate_runs
 from lyapnet.task.constraints import Constraints
 from lyapnet.value.calculus import (
     ValueFunction,
@@ -32,6 +35,7 @@ class DecreaseCondition(nn.Module):
         delta: δ ≥ 0, in cost per second. Near the goal all other terms tend to 0; δ > 0 leaves room for bounds.
         constraints: h; c ≤ 0 is required only where h(x) ≤ 0.
         disturbance: w ≥ 0, (n,), in the units of ẋ; None means no disturbance.
+        readings: how u is read and held; None: it is read at every t.
     """
 
     proves: ClassVar[str] = "above"  # the name of its proof in a file of kept proofs
@@ -45,6 +49,7 @@ class DecreaseCondition(nn.Module):
         delta: float,
         constraints: Constraints | None = None,
         disturbance: State | None = None,
+        readings: Readings | None = None,
     ):
         super().__init__()
         if not 0 < alpha <= 1:
@@ -55,15 +60,31 @@ class DecreaseCondition(nn.Module):
             raise UsageError(
                 "Expected a control law that a V defines, got one without V; certify a law from a value function."
             )
+        sizes = (closed_loop.system.n, closed_loop.system.m)
+        if readings is not None and (len(readings.errors), len(readings.control_errors)) != sizes:
+            raise UsageError(
+                f"Expected errors of {sizes[0]} states and {sizes[1]} controls, got {len(readings.errors)} and "
+                f"{len(readings.control_errors)}; give one for each, or 0."
+            )
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
-        self.constraints = constraints
+        self.constraints, self.readings = constraints, readings
         self.register_buffer("disturbance", disturbance)
+
+    @property
+    def n(self) -> int:
+        """The number of states."""
+        return self.closed_loop.system.n
 
     @property
     def facts(self) -> dict[str, Any]:
         """The numbers that define the condition for a given closed loop, as plain data."""
         w = None if self.disturbance is None else self.disturbance.tolist()
-        return {"alpha": self.alpha, "delta": self.delta, "disturbance": w}
+        return {"alpha": self.alpha, "delta": self.delta, "disturbance": w, **self.facts_of_readings}
+
+    @property
+    def facts_of_readings(self) -> dict[str, Any]:
+        """Those of the readings; none where u is read at every t."""
+        return {} if self.readings is None else {"readings": self.readings.facts}
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.parts(t, x)[0]
@@ -74,6 +95,11 @@ class DecreaseCondition(nn.Module):
         Where u is known as a minimum, the third part may be larger than Ẇ.
         """
         paid, fall = self.decrease(t, x)
+        return paid - self.delta, self.height(t, x), fall - self.delta
+
+    def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
+        """(c, W, Ẇ) as in `parts`, for another control than policy(t, x)."""
+        paid, fall = self._decrease_under(t, x, u)
         return paid - self.delta, self.height(t, x), fall - self.delta
 
     def decrease(self, t: Time, x: State) -> tuple[PerState, PerState]:
@@ -90,14 +116,18 @@ class DecreaseCondition(nn.Module):
         if isinstance(loop.policy, ValuePolicy) and loop.policy.cost is loop.cost:  # u may be made for another ℓ
             least = loop.policy.least(t, x)
         if least is None:
-            u = loop.policy(t, x)
-            fall = self._pushed(time_derivative(self.V, loop.system, t, x, u), t, x)
-            return fall + self.alpha * loop.cost.running(x, u), fall
+            return self._decrease_under(t, x, loop.policy(t, x))
         V_x = self.V.value_and_state_gradient(t, x)[1]
         drift = self._pushed(gradients(self.V, t, x)[0] + drift_lie_derivative(loop.system, x, V_x), t, x)
         slope, (u, b, value) = input_lie_derivative(loop.system, x, V_x), least
         paid = drift + ((slope - self.alpha * b) * u).sum(-1) + self.alpha * (loop.cost.state(x) + value)
         return paid, drift + ((slope - b) * u).sum(-1) + value
+
+    def _decrease_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState]:
+        """(V̇ + αℓ, V̇) for a given control."""
+        loop = self.closed_loop
+        fall = self._pushed(time_derivative(self.V, loop.system, t, x, u), t, x)
+        return fall + self.alpha * loop.cost.running(x, u), fall
 
     def _pushed(self, fall: PerState, t: Time, x: State) -> PerState:
         return fall if self.disturbance is None else fall + self.worst_push(self.V.value_and_state_gradient(t, x)[1])
@@ -106,6 +136,43 @@ class DecreaseCondition(nn.Module):
         """Σ_i w_i |∂V/∂x_i|, the most that a disturbance adds to V̇."""
         assert self.disturbance is not None
         return (self.disturbance * slope.abs()).sum(-1)
+
+    def search_box(self, domain: tuple[Corner, Corner]) -> tuple[Tensor, Tensor]:
+        """The box of the points of `values`: the domain of (t, x), and one axis more where u is held."""
+        if self.readings is None:
+            return domain
+        lower, upper = domain
+        return torch.cat([lower, lower.new_zeros(1)]), torch.cat([upper, upper.new_ones(1)])
+
+    def values(self, points: Points) -> tuple[PerState, PerState]:
+        """(c, W) at points (t, x); c is −∞ at states that a constraint excludes.
+
+        Where u is held, the points are (t̂, x̂, a/span) as in Readings, and c is that of closed loops at t̂ + a.
+        """
+        t, x, now = points[:, 0], points[:, 1:], points[:, 1:]
+        if self.readings is None:
+            c = self(t, x)
+        else:
+            c, run = self.after_reading(self.readings, points)
+            x, now = x[:, :-1], run.x
+        return torch.where(self.excluded(now), -torch.inf, c), self.height(t, x)
+
+    def point_of(self, t: float, x: Sequence[float], after: float) -> Points:
+        """The point of `values` for a state, or for a reading and the seconds since then, (1, …)."""
+        point = torch.tensor([t, *x], dtype=torch.float64)
+        if self.readings is None:
+            return point[None]
+        return torch.cat([point, after / self.readings.span(point[:1]).clamp_min(1e-9)])[None]
+
+    def after_reading(self, readings: Readings, points: Points) -> tuple[PerState, Run]:
+        """(c, the state) of the worst of some closed loops at t̂ + a, for points (t̂, x̂, a/span)."""
+        run = simulate_runs(self.closed_loop, readings, points[:, 0], points[:, 1:-1], points[:, -1])
+        c = self.parts_under(run.t, run.x, run.u)[0]
+        worst = c.argmax(0, keepdim=True)
+        return c.gather(0, worst)[0], Run(*(
+            each.gather(0, worst.reshape(*worst.shape, *(1,) * (each.ndim - c.ndim)).expand(1, *each.shape[1:]))[0]
+            for each in run
+        ))  # fmt: skip
 
     def excluded(self, x: State) -> Bool[Tensor, "*batch"]:
         """Whether a constraint excludes a state."""
@@ -162,17 +229,31 @@ def own_constraints(constraints: Constraints, domain: tuple[Corner, Corner]) -> 
     return constraints if isinstance(constraints, OwnConstraints) else OwnConstraints(constraints, domain)
 
 
-def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int = 2) -> BoundedFunction:
-    """(c, W, Ẇ), and h if there are constraints, with bounds on boxes.
+def bounded_condition(
+    condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int = 2, level: float = float("inf")
+) -> Bounds:
+    """(c, W, Ẇ), and h if there are constraints, with bounds on boxes; for every control that readings allow.
 
     V̇ is the derivative of V's traced operations, so that c ≤ 0 proves that V falls even if V declares a wrong gradient.
     The control law is the one that runs, with the declared gradient.
+
+    Args:
+        level: of W, below which closed loops have been since t = 0; it matters for readings.
     """
     declared = condition.V
     try:
         condition.V = own_operations(declared, domain)
         h = None if condition.constraints is None else own_constraints(condition.constraints, domain)
-        return BoundedFunction(lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain, degree)
+        if condition.readings is None:
+            return BoundedFunction(
+                lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain, degree
+            )  # fmt: skip
+        loop, (lower, upper) = condition.closed_loop, domain
+        no_width = torch.nonzero((upper == lower)[1:]).flatten().tolist()  # states on which nothing depends
+        return BoundedReadings(
+            lambda t, x, u: (*condition.parts_under(t, x, u), *([] if h is None else [h(x)])), loop, condition.readings,
+            domain, condition.height, level, [*loop.system.constants, *no_width], condition.disturbance, degree,
+        )  # fmt: skip
     finally:
         condition.V = declared
 

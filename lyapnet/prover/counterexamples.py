@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.base.types import Corner, PerState, Points
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounded_readings import BoundedReadings
+from lyapnet.prover.bounds import BoundedFunction, Bounds
 from lyapnet.prover.condition import DecreaseCondition
 
 SAMPLES = 20_000  # points of the domain
@@ -15,17 +16,21 @@ STEPS = 40  # of an ascent; the last has 1/1000 of the domain's width
 
 
 class Counterexample(NamedTuple):
-    """A point at which the condition fails: its value c is positive, and so is the lower bound of c there."""
+    """A point at which the condition fails: its value c is positive, and so is the lower bound of c there.
+
+    Where u is held, u is read at (t, x), and a closed loop meets c after that.
+    """
 
     t: float
     x: list[float]
     condition: float  # c(t, x) > 0
     height: float  # W(t, x) = V(t, x) − δt
+    after: float = 0.0  # s since the reading; 0 where u is read at every t
 
 
 def find_counterexample(
     condition: DecreaseCondition,
-    bounded: BoundedFunction,
+    bounded: Bounds,
     lower: Corner,
     upper: Corner,
     level: float,
@@ -41,7 +46,7 @@ def find_counterexample(
 
 
 def lowest_violation(
-    condition: DecreaseCondition, bounded: BoundedFunction, points: Points, level: float
+    condition: DecreaseCondition, bounded: Bounds, points: Points, level: float
 ) -> Counterexample | None:
     """The point of lowest W among the given ones with W ≤ level and c > 0, confirmed by a bound of c or Ẇ; or None."""
     c, W = _values(condition, points)
@@ -49,12 +54,14 @@ def lowest_violation(
     candidates = candidates[W[candidates].argsort()][:256]
     if not len(candidates):
         return None
-    (c_low, _), _, (rise_low, _), *_ = bounded.bounds(points[candidates], points[candidates])
+    c_low, rise_low = _lower_bounds(condition, bounded, points[candidates])
     candidates = candidates[torch.maximum(c_low, rise_low) > 0]
     if not len(candidates):
         return None
     first = candidates[0]
-    return Counterexample(float(points[first, 0]), points[first, 1:].tolist(), float(c[first]), float(W[first]))
+    t, x, *share = points[first].split([1, condition.n, len(points[first]) - 1 - condition.n])
+    after = 0.0 if condition.readings is None else float(share[0] * condition.readings.span(t))
+    return Counterexample(float(t), x.tolist(), float(c[first]), float(W[first]), after)
 
 
 def violations(
@@ -64,11 +71,14 @@ def violations(
     count: int,
     generator: torch.Generator | None = None,
 ) -> Points:
-    """At most `count` points (t, x) with c > 0 and W ≤ level, those of greatest c; not confirmed by bounds."""
-    points = _likely_violations(condition, *domain, level, generator)
+    """At most `count` points (t, x) with c > 0 and W ≤ level, those of greatest c; not confirmed by bounds.
+
+    Where u is held they are readings, after which c > 0.
+    """
+    points = _likely_violations(condition, *condition.search_box(domain), level, generator)
     c, W = _values(condition, points)
     worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
-    return points[worst.indices[worst.values > 0]]
+    return points[worst.indices[worst.values > 0], : 1 + condition.n]
 
 
 def _likely_violations(
@@ -91,7 +101,7 @@ def _ascend(condition: DecreaseCondition, points: Points, lower: Corner, upper: 
     for step in range(STEPS):
         with torch.enable_grad():
             leaf = path[-1].detach().requires_grad_()
-            c = condition(leaf[:, 0], leaf[:, 1:]).sum()
+            c = condition.values(leaf)[0].sum()
             (slope,) = torch.autograd.grad(c, leaf, materialize_grads=True)
         length = 0.05 * 0.9**step * (upper - lower)
         path.append((path[-1] + length * slope.sign().nan_to_num()).clamp(lower, upper))
@@ -101,6 +111,16 @@ def _ascend(condition: DecreaseCondition, points: Points, lower: Corner, upper: 
 def _values(condition: DecreaseCondition, points: Points) -> tuple[PerState, PerState]:
     """(c, W), where c is −∞ at states that a constraint excludes, so that they are no counterexamples."""
     with torch.no_grad():
-        t, x = points[:, 0], points[:, 1:]
-        c = condition(t, x)
-        return torch.where(condition.excluded(x), -torch.inf, c), condition.height(t, x)
+        return condition.values(points)
+
+
+def _lower_bounds(condition: DecreaseCondition, bounded: Bounds, points: Points) -> tuple[PerState, PerState]:
+    """Lower bounds of c and Ẇ at points."""
+    if isinstance(bounded, BoundedReadings):
+        with torch.no_grad():
+            run = condition.after_reading(bounded.readings, points)[1]
+        (c_low, _), _, (rise_low, _), *_ = bounded.at(points, run)
+    else:
+        assert isinstance(bounded, BoundedFunction)
+        (c_low, _), _, (rise_low, _), *_ = bounded.bounds(points, points)
+    return c_low, rise_low

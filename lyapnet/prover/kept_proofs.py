@@ -31,7 +31,7 @@ from lyapnet.base.plain_data import plain_data_of
 from lyapnet.base.types import Corner
 from lyapnet.graphs import tracing
 from lyapnet.graphs.compilation import FLAGS
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounds import Bounds
 from lyapnet.prover.boxes import CutTree
 from lyapnet.prover.branch_and_bound import Search, just_below
 from lyapnet.prover.condition import DecreaseCondition
@@ -76,7 +76,7 @@ class ProofState(NamedTuple):
         return min(self.level, just_below(self.search.least))
 
 
-def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
+def about(bounded: Bounds, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
     """What a proof is about, as plain data."""
     box = {"lower": lower.tolist(), "upper": upper.tolist(), "degree": bounded.degree}
     return {"proves": condition.proves, "fingerprint": bounded.fingerprint, **box, **condition.facts}

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Corner, Points
-from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.bounds import Bounds
 from lyapnet.prover.boxes import Boxes, single
 from lyapnet.prover.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
@@ -63,6 +63,7 @@ def tell(report: Callable[[Progress], None] | None, budget: Budget, stage: str) 
 
 CPU = torch.device("cpu")
 LEVEL_DROP = 1e-2  # the level is 1 % below W of a counterexample: boxes that approach it would become ever smaller
+CHUNK_OF_READINGS = 4096  # boxes at once, at least, where several functions are bounded for each
 SAVE_INTERVAL = 30.0  # seconds between two writes of the file that keeps a proof
 MAX_CENTRES = 1000  # undecided boxes whose centres are in the result, at most
 
@@ -102,8 +103,11 @@ def prove(
         UsageError: the file keeps the proof of something else.
     """
     budget = budget or Budget()
+    if condition.readings is not None:
+        budget = dataclasses.replace(budget, chunk=max(budget.chunk, CHUNK_OF_READINGS))
     lower, upper = (side.double() for side in domain)
-    bounded = bounded_condition(condition, (lower, upper), degree)
+    bounded = bounded_condition(condition, (lower, upper), degree, wanted)
+    lower, upper = condition.search_box((lower, upper))
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample, torch.device(budget.device))
     kept = None if keep is None else KeptProof(keep, about(bounded, condition, lower, upper), wanted)
     if kept is not None and replay:
@@ -118,7 +122,7 @@ def prove(
     def state() -> ProofState:
         return ProofState(search, question.level, question.worst, earlier + budget.elapsed)
 
-    make_question = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
+    make_question = partial(bounded_again, condition, domain, degree, wanted, proved_by(bounded))
     with bounding(question, budget.workers, budget.ray, make_question) as run:
         for _ in search.rounds(question, budget, run):
             if kept is not None and budget.elapsed > saved + SAVE_INTERVAL:
@@ -131,24 +135,29 @@ def prove(
         kept.write(end)
     return Proof(
         -torch.inf if question.settled else end.proved, wanted, end.worst, search.boxes, end.seconds,
-        search.frontier.share(lower, upper), search.frontier.center[:MAX_CENTRES], bounded.fingerprint,
+        search.frontier.share(lower, upper), search.frontier.center[:MAX_CENTRES, : len(domain[0])],
+        bounded.fingerprint,
     )  # fmt: skip
 
 
-def proved_by(bounded: BoundedFunction) -> tuple[str, str, str]:
+def proved_by(bounded: Bounds) -> tuple[str, str, str]:
     """(hash of the bounded function, hash of the code that bounds it, version of torch)."""
     return bounded.fingerprint, hash_of_sources(), str(torch.__version__)
 
 
 def bounded_again(
-    condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int, by: tuple[str, str, str]
+    condition: DecreaseCondition,
+    domain: tuple[Corner, Corner],
+    degree: int,
+    wanted: float,
+    by: tuple[str, str, str],
 ) -> "WhereItHolds":
     """The question on another machine, where the condition is traced again.
 
     Raises:
         UsageError: the traced function or the code that bounds it differs there.
     """
-    bounded = bounded_condition(condition, domain, degree)
+    bounded = bounded_condition(condition, domain, degree, wanted)
     if proved_by(bounded) != by:
         raise UsageError(
             "Expected the same condition, lyapnet and torch on each machine of the cluster, got others; install the "
@@ -162,7 +171,7 @@ class WhereItHolds(Question):
     """The question up to which level of W the condition c ≤ 0 holds; the key of a box is its lower bound of W."""
 
     condition: DecreaseCondition
-    bounded: BoundedFunction  # (c, W, Ẇ) and, with constraints, h
+    bounded: Bounds  # (c, W, Ẇ) and, with constraints, h
     level: float  # it can only become lower
     stop_at_counterexample: bool
     device: torch.device = CPU  # on which boxes are bounded
@@ -211,7 +220,7 @@ class WhereItHolds(Question):
             ValueError: the condition holds at that point.
         """
         if worst is not None:
-            point = torch.tensor([[worst.t, *worst.x]], dtype=torch.float64)
+            point = self.condition.point_of(worst.t, worst.x, worst.after)
             found = lowest_violation(self.condition, self.bounded, point, float("inf"))
             if found is None or not abs(found.height - worst.height) <= MARGIN * abs(found.height):
                 raise ValueError("the condition does not fail there")

@@ -1,0 +1,97 @@
+"""Laws that are read at times and held: when they are read, how far what is read may be off, and closed loops then."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+from lyapnet.base.types import Control, PerState, State, Time
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+
+STEPS, RUNS = 2, 3  # of a simulation after a reading; simulations from each reading, if there are errors
+
+
+@dataclass(frozen=True)
+class Readings:
+    """When a law is read, and how far what is read and what is given may be off.
+
+    A control u = policy(t̂, x(t̂) + e) + r is used from t̂ + d on, 0 ≤ d ≤ delay, until the next one is, and so until
+    interval + delay after t̂ at most. Controls are used in the order of their readings, that of t̂ = 0 at once.
+
+    Args:
+        interval: the longest time between two readings, in s.
+        delay: the longest time from a reading to the use of its control, in s.
+        errors: the largest |e_i| of each measured state, in its unit, (n,).
+        control_errors: the largest |r_j| of each control, in its unit, (m,).
+        duration: T in s; None for a law that is read as u(0, x), at every time and for ever.
+    """
+
+    interval: float
+    delay: float
+    errors: Sequence[float]
+    control_errors: Sequence[float]
+    duration: float | None
+
+    @property
+    def receding(self) -> bool:
+        """Whether the law is read as u(0, x)."""
+        return self.duration is None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The numbers as plain data."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @property
+    def longest(self) -> float:
+        """The longest time from a reading to the end of the use of its control, in s."""
+        return self.interval + self.delay if not self.delay else math.nextafter(self.interval + self.delay, math.inf)
+
+    def control(self, loop: ClosedLoop, t: Time, x: State, e: State, r: Control) -> Control:
+        """The control of a reading at (t, x)."""
+        return loop.policy(torch.zeros_like(t) if self.receding else t, x + e) + r
+
+    def span(self, t: Time) -> Time:
+        """The longest time in s from a reading at t to the end of the use of its control: at most up to T."""
+        span = torch.full_like(t, self.longest)
+        return span if self.duration is None else torch.minimum(span, self.duration - t)
+
+
+class Run(NamedTuple):
+    """Closed loops at an age after a reading, (runs, *batch, …) each."""
+
+    t: Time
+    x: State
+    u: Control  # the control in use
+    drift: State  # the mean of ẋ since the reading, minus ẋ at the reading
+    e: State
+    r: Control
+
+
+def simulate_runs(loop: ClosedLoop, readings: Readings, t: Time, x: State, share: PerState) -> Run:
+    """Closed loops at t + share · span(t), if the law is read at (t, x) and its control used at once, by Runge-Kutta
+    steps: without errors, and with random ones of their largest size.
+    """
+    bounds = [x.new_tensor(each) for each in (readings.errors, readings.control_errors)]
+    generator, age, runs = torch.Generator().manual_seed(0), share * readings.span(t), []
+    for k in range(RUNS if any(readings.errors) or any(readings.control_errors) else 1):
+        signs = [2 * torch.randint(2, each.shape, generator=generator).to(x) - 1 for each in bounds]
+        e, r = ((bound * sign * (k > 0)).expand(*x.shape[:-1], -1) for bound, sign in zip(bounds, signs, strict=True))
+        u, now = readings.control(loop, t, x, e, r), x
+        for _ in range(STEPS):
+            now = _runge_kutta(loop, now, u, age / STEPS)
+        drift = (now - x) / age.clamp_min(1e-9)[..., None] - loop.system.dynamics(x, u)
+        runs.append((t + age, now, u, torch.where(age[..., None] > 1e-9, drift, 0.0), e, r))
+    return Run(*(torch.stack(each) for each in zip(*runs, strict=True)))
+
+
+def _runge_kutta(loop: ClosedLoop, x: State, u: Control, step: PerState) -> State:
+    """x after one step of the classical Runge-Kutta method with u held."""
+    h, rate = step[..., None], loop.system.dynamics
+    k1 = rate(x, u)
+    k2 = rate(x + h / 2 * k1, u)
+    k3 = rate(x + h / 2 * k2, u)
+    k4 = rate(x + h * k3, u)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
     from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem
+    from lyapnet.task.varying_limits import LimitTable, VaryingLimits
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
     from lyapnet.training.modules import ValueModule
@@ -92,6 +93,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "task.ball": ["ControlBall"],
     "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
     "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem"],
+    "task.varying_limits": ["LimitTable", "VaryingLimits"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
     "training.modules": ["ValueModule"],
@@ -124,6 +126,7 @@ __all__ = [
     "HJBPolicy",
     "Horizon",
     "InitialStateDataModule",
+    "LimitTable",
     "LogCosCost",
     "LookaheadPolicy",
     "LowerBound",
@@ -161,6 +164,7 @@ __all__ = [
     "ValueFunction",
     "ValueModule",
     "ValueProgram",
+    "VaryingLimits",
     "__version__",
     "certify",
     "evaluate",

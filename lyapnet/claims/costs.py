@@ -97,6 +97,6 @@ def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> T
     try:
         oracle = oracle_of(controller.problem, controller.method)
         some = x0 if isinstance(oracle, RiccatiOracle) else x0[:SEARCHED]
-        return oracle.solve(some, controller.rollout(some).u, in_time).cost.double()
+        return oracle.solve(some, controller.closed_loops(some).u, in_time).cost.double()
     except OracleError:
         return None

@@ -20,6 +20,7 @@ from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_consta
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
+from lyapnet.task.varying_limits import VaryingLimits
 from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
@@ -89,6 +90,10 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
     """
     if controller.system.constants:
         raise UsageError("Expected one system, got a family; choose one member of it (option at).")
+    if isinstance(controller.controls, VaryingLimits):
+        raise UsageError(
+            f"Expected constant limits of controls with {OPTION}, got some that depend on the state; leave it out."
+        )
     system = copied(controller.system)  # a copy, so that changes of its parameters do not reach the law
     _require_arguments(system, ranges)
     lower, upper = (torch.tensor([ends[i] for ends in ranges.values()], dtype=torch.float64) for i in (0, 1))

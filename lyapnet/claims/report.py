@@ -211,13 +211,14 @@ def _name(system: ControlSystem) -> str:
 def _controls(controller: Controller, config: Config) -> dict[str, Any]:
     """The limits of U with None for ∞; the class and parameters of another set; empty if U = ℝᵐ."""
     controls = controller.controls
-    if controls.limits is None or not controls.is_box:
+    limits = controls.fixed_limits
+    if limits is None or not controls.is_box:
         numbers = {name: each.tolist() for name, each in controls.named_buffers()}
         name = f"{type(controls).__module__}:{type(controls).__qualname__}"
         return {"name": name, **numbers, **config.controls.parameters}
     if not controls.limited:
         return {}
-    sides = (side.expand(controller.system.m).tolist() for side in controls.limits)
+    sides = (side.expand(controller.system.m).tolist() for side in limits)
     finite = ([limit if math.isfinite(limit) else None for limit in side] for side in sides)
     return dict(zip(("lower", "upper"), finite, strict=True))
 

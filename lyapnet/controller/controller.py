@@ -32,6 +32,7 @@ from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem
+from lyapnet.task.varying_limits import VaryingLimits, written_cost, written_system
 from lyapnet.value.after_horizon import AfterHorizon, choose_law
 from lyapnet.value.at_parameters import AtParameters
 from lyapnet.value.calculus import ValueFunction
@@ -167,12 +168,12 @@ class Controller:
     @property
     def system(self) -> ControlSystem:
         """ẋ = f(x) + g(x)u."""
-        return self.problem.system
+        return written_system(self.problem.system)
 
     @property
     def cost(self) -> Cost:
         """ℓ and φ."""
-        return self.problem.cost
+        return written_cost(self.problem.cost)
 
     @property
     def controls(self) -> ControlSet:
@@ -254,7 +255,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit, or t < 0.
         """
-        return self._evaluate(self.law, t, x, parameters)
+        return self._evaluate(lambda t, x: self.controls.applied(x, self.law(t, x)), t, x, parameters)
 
     def with_(self, **parameters: float) -> "Controller":
         """The controller of a family's member: its problem, and V(t, (x, p)) at fixed parameters.
@@ -303,6 +304,11 @@ class Controller:
         Raises:
             UsageError: there are no outputs, or they do not fit the system.
         """
+        if isinstance(self.controls, VaryingLimits):
+            raise UsageError(
+                "Expected constant limits of controls for an estimator, got some that depend on the state, which is "
+                "not known there; take the least of them."
+            )
         given = {
             "measure": [measure] if isinstance(measure, str) else None if measure is None else [*measure],
             "noise": _listed(noise),
@@ -380,13 +386,14 @@ class Controller:
                 trajectory = self._cut(trajectory, steps)
             elif steps is not None and steps > self.horizon.steps:
                 trajectory = self._prolong(trajectory, steps - self.horizon.steps)
+            trajectory = trajectory.applied(self.controls)
         return (
             trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(in_form_of(x0, field) for field in trajectory))
         )
 
     @torch.no_grad()
     def closed_loops(self, x0: Tensor, increments: Tensor | None = None, with_surprises: bool = True) -> Trajectory:
-        """The closed loops under given noise, see Rollout.forward."""
+        """The closed loops under given noise, see Rollout.forward; their controls are elements of U."""
         return self._rollout(x0, increments, with_surprises)
 
     def _increments(self, x0: Tensor, steps: int | None, given: Tensor | np.ndarray | int | None) -> Tensor | None:

@@ -83,10 +83,11 @@ def _table_of(controller: Any) -> str:
 def _controls(controller: Any) -> list[str]:
     """A line for each control with its limits."""
     system, controls = controller.system, controller.controls
-    if controls.limits is None or not controls.is_box:
+    limits = controls.fixed_limits
+    if limits is None or not controls.is_box:
         inside = f" in {controls}" if controls.limited else " without limits"
         return _first([label + inside for label in system.control_labels])
-    lower, upper = (limit.expand(system.m).tolist() for limit in controls.limits)
+    lower, upper = (limit.expand(system.m).tolist() for limit in limits)
     return _first([f"{n} {_interval(*ends)}" for n, *ends in zip(system.control_labels, lower, upper, strict=True)])
 
 
@@ -170,7 +171,7 @@ def _drawing(controller: Any) -> str:
         )
     trajectory = controller.rollout(x0)
     x, u, V = (part.numpy(force=True) for part in (trajectory.x, trajectory.u, trajectory.require_value()))
-    lower, upper = controller.controls.limits or (torch.tensor(-np.inf), torch.tensor(np.inf))
+    lower, upper = controller.controls.fixed_limits or (torch.tensor(-np.inf), torch.tensor(np.inf))
     limits = torch.stack([lower.expand(system.m), upper.expand(system.m)], -1).tolist()
     moving, controls = moving_states(system)[:MOST_PANELS], range(system.m)[:MOST_PANELS]
     panels = [_Panel(system.state_labels[i], x[..., i], STATES) for i in moving]

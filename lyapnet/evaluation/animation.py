@@ -209,7 +209,8 @@ class Film:
 
     def _panels(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
         """Draw the panels of controls and cost; return the lines that grow, with their times and values."""
-        system, limits = self.problem.system, self.problem.controls.limits
+        system, x = self.problem.system, torch.as_tensor(self.x[:-1])
+        limits = self.problem.controls.limits_at(x.to(self.problem.goal))
         rows = min(system.m, 4)
         grid = self._grid[1].subgridspec(rows + 1, 1)
         panels: list[Axes] = [*grid.subplots(sharex=True, squeeze=False)[:, 0]]
@@ -218,7 +219,9 @@ class Film:
         for k, panel in enumerate(panels[:-1]):
             panel.set_title(system.control_labels[k], **above)
             for limit in limits or ():
-                if math.isfinite(height := float(limit.expand(system.m)[k])):
+                if limit.ndim > 1:  # of the first closed loop
+                    panel.plot(self.t[:-1], numpy_of(limit[:, 0, k]), color=GREY, linewidth=0.9, linestyle="--")
+                elif math.isfinite(height := float(limit.expand(system.m)[k])):
                     panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
             growing += self._lines(panel, self.u[..., k], GREEN)
         last = panels[-1]

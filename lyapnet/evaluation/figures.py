@@ -172,6 +172,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     t = numpy_of(trajectory.t)
     drawn, controls = states_and_controls_to_draw(system)
     goals, rests = trajectory.x - problem.cost.from_goal(trajectory.x), problem.rest_at(trajectory.x[:-1])
+    rests = problem.controls.applied(trajectory.x[:-1], rests)
     wanted = [numpy_of(goals[..., i]) if problem.has_goal else None for i in drawn]
     wanted += [numpy_of(rests[..., i]) for i in controls]
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
@@ -193,11 +194,13 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
             for i, height in zip(part.states.tolist(), part.limits.tolist(), strict=True):
                 if i in drawn:
                     panels[drawn.index(i)].axhline(height, color=VERMILION, linewidth=0.9, linestyle="--")
-    for limit in problem.controls.limits or ():
-        heights = limit.expand(system.m)[controls].tolist()
-        for panel, height in zip(panels[len(drawn) : len(curves)], heights, strict=True):
-            if math.isfinite(height):
-                panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
+    for limit in problem.controls.limits_at(trajectory.x[:-1]) or ():
+        paths = numpy_of(limit.expand(*limit.shape[:-1], system.m)[..., controls])
+        for k, panel in enumerate(panels[len(drawn) : len(curves)]):
+            if paths.ndim > 1:  # limits that depend on the state
+                panel.plot(t[:-1], paths[..., k], color=GREY, linewidth=0.5, linestyle="--")
+            elif math.isfinite(paths[k]):
+                panel.axhline(paths[k], color=GREY, linewidth=0.9, linestyle="--")
     last = panels[len(curves)]
     for name, paths, style in (
         ("cost to go", to_go, {"color": ORANGE}),

@@ -212,7 +212,7 @@ def _evaluation_on_model(
     controller: Controller, x0: State, samples: int, seed: int, optimum: bool, progress: Report
 ) -> Evaluation:
     """The measures without noise, on the model."""
-    trajectory = controller.rollout(x0)
+    trajectory = controller.closed_loops(x0)  # whose controls are elements of U, as optima are
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
     cost, left = cost_within_domain(controller.problem, trajectory)

@@ -2,5 +2,6 @@
 
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.sets import ControlSet, Unbounded
+from lyapnet.task.varying_limits import LimitTable
 
-CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded, "ball": ControlBall}
+CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded, "ball": ControlBall, "table": LimitTable}

@@ -158,6 +158,9 @@ class DomainCost(MadeOfAnother):
     def R(self, x: State) -> ControlMatrix:
         return self.cost.R(self.domain.nearest(x))
 
+    def rest_at(self, x: State) -> Tensor | None:
+        return self.cost.rest_at(self.domain.nearest(x))
+
     def terminal(self, x: State) -> PerState:
         return self.cost.terminal(self.domain.nearest(x)) + self.weight * self.domain.price(x)
 

@@ -27,6 +27,7 @@ from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.task.noise import Noise, SystemNoise
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem, functions_of_state
+from lyapnet.task.varying_limits import VaryingLimits, in_shares, written_system
 
 GOAL_TEST_STEPS = 200  # largest number of steps in the test whether a task has a goal
 TRIED = 64  # states at which users' functions are tested
@@ -100,6 +101,9 @@ class Problem(nn.Module):
                     f"Expected {name} of {type(cost).__name__} of shape ({expected},), got {tuple(given.shape)}; give "
                     "one number for each."
                 )
+        if isinstance(controls, VaryingLimits):
+            controls = controls.of(written_system(system))
+            system, cost = in_shares(system, cost, controls, torch.zeros_like(initial_states.lower))
         if not (system.affine or (controls.is_box and controls.limits is not None)):
             raise UsageError(
                 f"Expected limits of each control, or none, for a system that is not control-affine, got "
@@ -351,6 +355,8 @@ class Problem(nn.Module):
         name = type(system).__name__
         generator = torch.Generator().manual_seed(0)
         x = own.initial_states.sample(256, generator)
+        if isinstance(own.controls, VaryingLimits):
+            own.controls.check(x, m)
         own.check_shapes(x[:TRIED])
         for contract in (*contracts_of_system(system), *contracts_of_cost(cost, m)):
             check_function(contract.name, contract.function, [x[:TRIED]], contract.shape)

@@ -126,6 +126,23 @@ class ControlSet(nn.Module, ABC):
         """Whether U is all of the box of its `limits`."""
         return True
 
+    @property
+    def fixed_limits(self) -> tuple[Tensor, Tensor] | None:
+        """The `limits` of the controls themselves, if they are the same at every state."""
+        return self.limits
+
+    def limits_at(self, x: State) -> tuple[Tensor, Tensor] | None:
+        """(lower, upper) of the controls that act at x, each () or (*batch, m); None if they are not known."""
+        return self.limits
+
+    def applied(self, x: State, u: Control) -> Control:
+        """The control that acts at x for an element u of U: u itself, unless U has shares of limits that vary."""
+        return u
+
+    def asked(self, x: State, u: Control) -> Control:
+        """The element of U that a control at x stands for: the inverse of `applied`, without its rounding."""
+        return u
+
     def excess(self, u: Control) -> Tensor | None:
         """Smooth functions (*batch, k) of u that are ≤ 0 in U, beside its `limits`; None if there are none."""
         return None

@@ -58,8 +58,10 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
     problem = learner.problem
     x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
     with torch.no_grad():
-        sample = learner.roll_out(x0, FIGURES)
-        noisy = None if problem.noise is None else learner.roll_out(states_to_draw(x0), FIGURES)
+        sample = learner.roll_out(x0, FIGURES).applied(problem.controls)
+        noisy = None
+        if problem.noise is not None:
+            noisy = learner.roll_out(states_to_draw(x0), FIGURES).applied(problem.controls)
     drawn = {
         "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),

@@ -76,7 +76,8 @@ class Regulator(nn.Module):
         else:
             products = self.basis(self._parameters_of(x))
             feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(products, self.K, strict=True)])
-        return self.problem.controls.project(self.problem.rest_at(x) - feedback)
+        # K is about the control at the goal, which may be another than u* at x
+        return self.problem.controls.project(self.problem.rest_at(x - offset) - feedback)
 
     def cost(self, x: State) -> PerState:
         """The cost to go without control limits."""

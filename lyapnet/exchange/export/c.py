@@ -155,7 +155,7 @@ def box_table(name: str, lower: Tensor, upper: Tensor) -> str:
 def limits_of(controller: Controller, style: Style) -> tuple[Tensor, Tensor] | None:
     """The limits (m,) of the controls in the precision of a style, rounded inwards; None if there are none."""
     controls = controller.controls
-    if not isinstance(controls, ControlBox):
+    if not isinstance(controls, ControlBox) or controls.fixed_limits is None:
         return None
     rounded = ControlBox(controls.lower.double().cpu(), controls.upper.double().cpu()).to(style.dtype)
     m = controller.system.m
@@ -164,7 +164,7 @@ def limits_of(controller: Controller, style: Style) -> tuple[Tensor, Tensor] | N
 
 def has_limits(controls: ControlSet, style: Style) -> bool:
     """Whether u is moved into its limits once more: in single precision a limit is rounded, and may be passed."""
-    return style.single and isinstance(controls, ControlBox)
+    return style.single and isinstance(controls, ControlBox) and controls.fixed_limits is not None
 
 
 INSIDE = """static int is_inside(int n, const double *x, const double (*box)[2])

@@ -33,13 +33,14 @@ def facts_of(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
     if constants:
         facts["P"] = _ranges(names, units, box.lower, box.upper, constants)
     facts["limits"] = "none" if not problem.controls.limited else str(problem.controls)
-    if isinstance(problem.controls, ControlBox):
-        low, high = (side.expand(system.m) for side in (problem.controls.lower, problem.controls.upper))
+    limits = problem.controls.fixed_limits
+    if isinstance(problem.controls, ControlBox) and limits is not None:
+        low, high = (side.expand(system.m) for side in limits)
         facts["limits"] = _ranges(system.control_names, system.control_units, low, high, range(system.m))
     if problem.follows_reference:
         facts["target"] = "a reference"
     elif problem.has_goal:
-        goal, rest = problem.goal.tolist(), problem.rest.tolist()
+        goal, rest = problem.goal.tolist(), problem.controls.applied(problem.goal, problem.rest).tolist()
         held = _values(system.control_names, system.control_units, rest, range(system.m))
         facts["target"] = f"{_values(names, units, goal, states)}; held by {held}"
     held = "; u is made to be held for it" if controller.law.held else ""

@@ -11,6 +11,7 @@ from torch.fx import GraphModule
 from lyapnet.base.errors import ExportError
 from lyapnet.controller.controller import Controller
 from lyapnet.graphs.tracing import core_trace
+from lyapnet.task.varying_limits import VaryingLimits
 
 
 class Law:
@@ -18,13 +19,17 @@ class Law:
 
     Args:
         controller: whose law it is.
+        dtype: precision in which it will be computed; None: that of the controller.
 
     Raises:
         ExportError: the law after T is an error; or, where a trace is asked for, it cannot be made.
     """
 
-    def __init__(self, controller: Controller):
+    def __init__(self, controller: Controller, dtype: torch.dtype | None = None):
         self._continued = controller.law
+        self._controls = controller.controls
+        if isinstance(self._controls, VaryingLimits) and dtype is not None:
+            self._controls = self._controls.rounded_for(dtype)
         if self._continued.beyond == "error":
             raise ExportError(
                 "Expected a law after T that another language can follow, got beyond=error; take hold, receding or "
@@ -43,7 +48,7 @@ class Law:
     @cached_property
     def control(self) -> GraphModule:
         """(u (m,),)"""
-        return self._traced(lambda t, x: (self._continued.at_any_time(t, x)[0],))
+        return self._traced(lambda t, x: (self._applied(t, x),))
 
     @cached_property
     def value(self) -> GraphModule:
@@ -53,7 +58,11 @@ class Law:
     @cached_property
     def both(self) -> GraphModule:
         """(u, V)"""
-        return self._traced(lambda t, x: (self._continued.at_any_time(t, x)[0], self._continued.V.at_any_time(t, x)[0]))
+        return self._traced(lambda t, x: (self._applied(t, x), self._continued.V.at_any_time(t, x)[0]))
+
+    def _applied(self, t: Tensor, x: Tensor) -> Tensor:
+        """u (m,) of a batch of one state."""
+        return self._controls.applied(x, self._continued.at_any_time(t, x))[0]
 
     def _traced(self, function: Callable[[Tensor, Tensor], tuple[Tensor, ...]]) -> GraphModule:
         def of_one(t: Tensor, *state: Tensor) -> tuple[Tensor, ...]:

@@ -80,7 +80,7 @@ def verify(
     t, x, *_ = points(controller) if tried is None else tried
     law = controller.law
     with torch.no_grad():
-        expected = law.at_any_time(t, x), law.V.at_any_time(t, x)
+        expected = controller.controls.applied(x, law.at_any_time(t, x)), law.V.at_any_time(t, x)
     found = evaluate(t.double().cpu().numpy(), x.double().cpu().numpy())
     differences = [_difference(own, other) for own, other in zip(expected, found, strict=True)]
     agreement = Agreement(len(t), differences[0], differences[1])

@@ -81,7 +81,7 @@ def export(
         raise UsageError(
             f"Expected an estimator with --to {' or '.join(IN_C)}, got {to}; the others have the law alone."
         )
-    facts, law = facts_of(controller, checkpoint), Law(controller)
+    facts, law = facts_of(controller, checkpoint), Law(controller, DTYPES[dtype] if to in IN_C else None)
     try:
         place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
     except OSError as error:

@@ -16,6 +16,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.experiment.config import Config
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.varying_limits import VaryingLimits
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import ValuePolicy
 
@@ -100,6 +101,11 @@ def controller_of(
         UsageError: it is about a family, or V or u has another shape.
     """
     require_one_system(problem)
+    if isinstance(problem.controls, VaryingLimits):
+        raise UsageError(
+            "Expected constant limits of controls for a network of others, got some that depend on the state; take "
+            "constant ones."
+        )
     problem = copied(problem)
     v, k = (copy.deepcopy(each).double().cpu().eval().requires_grad_(False) for each in (value, law))
     for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):

@@ -24,12 +24,12 @@ def functions_of(controller: Controller) -> str:
 
     def look(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
         output = loop.control(t, x[None])
-        return output.u[0], output.value[0]
+        return problem.controls.applied(x[None], output.u)[0], output.value[0]
 
     def step(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
         after, _, cost, u, V = one_step(t, dt, x[None])
         assert V is not None
-        return after[0], cost[0], u[0], V[0]
+        return after[0], cost[0], problem.controls.applied(x[None], u)[0], V[0]
 
     def about(x: Tensor) -> tuple[Tensor, ...]:
         goal = x[None] - problem.cost.from_goal(x[None])

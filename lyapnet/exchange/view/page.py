@@ -78,7 +78,7 @@ def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None)
     """What the page is told of a controller, as plain data; null stands for what is not finite."""
     problem, system, box = controller.problem, controller.system, controller.initial_states
     center = box.center
-    limits = problem.controls.limits or (-torch.inf, torch.inf)
+    limits = problem.controls.fixed_limits or (-torch.inf, torch.inf)
     sides = [torch.as_tensor(side).to(center).expand(system.m).tolist() for side in limits]
     extent = _extent(controller, funnel)
     family = isinstance(system, FamilySystem)

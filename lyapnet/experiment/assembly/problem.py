@@ -24,6 +24,11 @@ from lyapnet.experiment.assembly.outputs import estimator_parts
 from lyapnet.experiment.assembly.reference import reference_of, require_points
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
+from lyapnet.experiment.assembly.varying_limits import (
+    constant_limits,
+    refuse_beside_varying_limits,
+    require_rest_within_limits,
+)
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
 from lyapnet.task.contracts import check_shapes_of_controls, check_shapes_of_cost, check_shapes_of_system
 from lyapnet.task.cost import (
@@ -41,6 +46,7 @@ from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box, ControlBox, ControlSet
 from lyapnet.task.systems import ControlSystem, Linear
+from lyapnet.task.varying_limits import VaryingLimits
 
 
 def build_problem(config: Config, parts: Parts | None = None) -> Problem:
@@ -77,6 +83,9 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
+        if isinstance(controls, VaryingLimits):
+            refuse_beside_varying_limits(config)
+            copied(controls.of(system)).check(x, system.m)
         controls = _with_control_costs(config, cost, controls, system.m)
         require_points(config.reference)
         if config.reference.points:
@@ -86,7 +95,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
                 config, system, cost, controls, initial_states, own_cost=parts.cost is not None
             )
         elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
-            cost = about_target(config, cost, system, controls, initial_states)
+            cost = about_target(config, cost, system, constant_limits(controls), initial_states)
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(
@@ -98,6 +107,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             noise=build_noise(config, system),
             risk=config.risk,
         )
+        require_rest_within_limits(problem)
         check_risk(config, problem)
         if not config.family and config.cost.name not in COSTS:
             _refuse_free_controls_of_own_cost(problem)
@@ -128,7 +138,7 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
-        return system, trim(config, system, controls, initial_states)
+        return system, trim(config, system, constant_limits(controls), initial_states)
 
 
 def _checked_states(system: ControlSystem, initial_states: Box) -> State:
@@ -157,6 +167,8 @@ def _refuse_free_controls(
             return
         weighted = build_cost(replace(_cost_section(config), R=1.0), system)
         controls = build_controls(config.controls, system) if controls is None else controls.double()
+        if isinstance(controls, VaryingLimits):
+            return
         cost = about_target(config, weighted, system, controls, initial_states)
         problem = Problem(system, cost, controls, initial_states, horizon)
     except (LyapnetError, ValueError, TypeError, RuntimeError):

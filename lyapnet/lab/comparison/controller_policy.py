@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 
 from lyapnet.controller.controller import Controller
 
@@ -47,5 +48,5 @@ class ControllerPolicy:
         return self._action(steps * self.controller.horizon.dt, x), (steps + 1,)
 
     def _action(self, t: np.ndarray, x: np.ndarray) -> np.ndarray:
-        u: Any = self.controller.policy(t, x)
-        return u / self.control_scale
+        u, like = torch.as_tensor(self.controller.policy(t, x)), self.controller.initial_states.lower
+        return self.controller.controls.asked(torch.as_tensor(x).to(like), u).numpy() / self.control_scale

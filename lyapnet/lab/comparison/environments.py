@@ -66,8 +66,10 @@ class Episodes:
             )
         self.clipped += int((given.abs() >= 1).sum())  # at the bound: learners clip before they ask
         self.controls += given.numel()
-        self.control = self.problem.controls.project(self.scale * given.clamp(-1, 1))
-        following, paid = self.problem.step(self.state, self.control)
+        controls = self.problem.controls
+        asked = controls.project(self.scale * given.clamp(-1, 1))
+        following, paid = self.problem.step(self.state, asked)
+        self.control = controls.applied(self.state, asked)
         if noise is not None and increment is not None:
             following = following + noise.displacement(self.state, increment)
         self.state = following

@@ -14,6 +14,7 @@ from lyapnet.loop.rollout.expectations import martingale, surprises
 from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
+from lyapnet.task.sets import ControlSet
 
 
 class Trajectory(NamedTuple):
@@ -25,6 +26,10 @@ class Trajectory(NamedTuple):
     running_cost: ValuePath  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: PerState  # (*batch,): φ(x_N)
     value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), if a V defines the control law
+
+    def applied(self, controls: ControlSet) -> "Trajectory":
+        """The same with the controls that act, of a trajectory whose controls are elements of U."""
+        return self._replace(u=controls.applied(self.x[:-1], self.u))
 
     def require_value(self) -> ValuePath:
         """V along the trajectory.

@@ -13,6 +13,7 @@ from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlBox, Unbounded
 from lyapnet.task.systems import Linear, Pendulum
+from lyapnet.task.varying_limits import LimitTable
 from lyapnet.value.expansions import dynamic_programming, held_control, optimal_trajectories, path_under, riccati
 
 PLANE = [[0.0, 0, 1, 0], [0, 0, 0, 1], [0, 0, -0.1, 0], [0, 0, 0, -0.2]]
@@ -28,6 +29,10 @@ def problem_with(costs, controls, system=None, method="euler", steps=30):
     return Problem(system, cost, controls, Box([0.4] * n, [1.0] * n), Horizon(steps, 0.1, method))
 
 
+def falling():
+    return LimitTable("velocity", [-3, 0, 3], [9.0, 9.0, 2.0], [-2.0, -9.0, -9.0])
+
+
 CASES = {
     "norm in a ball": lambda: problem_with([NormCost(0.3)], ControlBall(1.2)),
     "ball": lambda: problem_with(None, ControlBall(1.2)),
@@ -39,6 +44,8 @@ CASES = {
         [NormCost(0.05), LogCosCost(0.05, 4.0)], ControlBox(-3.9999, 3.9999), Pendulum()
     ),
     "a thruster": lambda: problem_with([AbsoluteCost(0.3)], ControlBox([0.0, -1.0], [1.0, 0.0])),
+    "limits that fall with speed": lambda: problem_with(None, falling(), Pendulum()),
+    "limits that fall with speed, rk4": lambda: problem_with(None, falling(), Pendulum(), method="rk4"),
     "log-cos": lambda: problem_with([LogCosCost(0.05, 4.0)], ControlBox(-3.9999, 3.9999), Pendulum()),
 }
 

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         PseudoHuberControlCost,
         SeparableCost,
     )
+    from lyapnet.task.ellipsoid import ControlEllipsoid
     from lyapnet.task.horizon import Horizon
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
@@ -91,6 +92,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "loop.programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
     "loop.rollout": ["Rollout", "Trajectory"],
     "task.ball": ["ControlBall"],
+    "task.ellipsoid": ["ControlEllipsoid"],
     "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
     "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem"],
     "task.varying_limits": ["LimitTable", "VaryingLimits"],
@@ -116,6 +118,7 @@ __all__ = [
     "ControlBox",
     "ControlCost",
     "ControlCosts",
+    "ControlEllipsoid",
     "ControlSet",
     "ControlSystem",
     "Controller",

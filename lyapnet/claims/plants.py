@@ -17,10 +17,10 @@ from lyapnet.loop.random_plants import NominalLaw
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.readings import Readings
 from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_constant_states
+from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
-from lyapnet.task.varying_limits import VaryingLimits
 from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
@@ -90,9 +90,9 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
     """
     if controller.system.constants:
         raise UsageError("Expected one system, got a family; choose one member of it (option at).")
-    if isinstance(controller.controls, VaryingLimits):
+    if isinstance(controller.controls, MappedControls):
         raise UsageError(
-            f"Expected constant limits of controls with {OPTION}, got some that depend on the state; leave it out."
+            f"Expected constant limits of controls with {OPTION}, got {controller.controls.words}; leave it out."
         )
     system = copied(controller.system)  # a copy, so that changes of its parameters do not reach the law
     _require_arguments(system, ranges)

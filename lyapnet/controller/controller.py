@@ -29,10 +29,10 @@ from lyapnet.loop.rollout.runge_kutta import Step
 from lyapnet.task.cost import Cost
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.mapped_controls import MappedControls, written_cost, written_system
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem
-from lyapnet.task.varying_limits import VaryingLimits, written_cost, written_system
 from lyapnet.value.after_horizon import AfterHorizon, choose_law
 from lyapnet.value.at_parameters import AtParameters
 from lyapnet.value.calculus import ValueFunction
@@ -304,10 +304,10 @@ class Controller:
         Raises:
             UsageError: there are no outputs, or they do not fit the system.
         """
-        if isinstance(self.controls, VaryingLimits):
+        if isinstance(self.controls, MappedControls):
             raise UsageError(
-                "Expected constant limits of controls for an estimator, got some that depend on the state, which is "
-                "not known there; take the least of them."
+                f"Expected constant limits of controls, or a ball, for an estimator, got {self.controls.words}; take "
+                "another set."
             )
         given = {
             "measure": [measure] if isinstance(measure, str) else None if measure is None else [*measure],

@@ -24,10 +24,10 @@ from lyapnet.task.contracts import (
 from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
+from lyapnet.task.mapped_controls import MappedControls, mapped, written_system
 from lyapnet.task.noise import Noise, SystemNoise
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem, functions_of_state
-from lyapnet.task.varying_limits import VaryingLimits, in_shares, written_system
 
 GOAL_TEST_STEPS = 200  # largest number of steps in the test whether a task has a goal
 TRIED = 64  # states at which users' functions are tested
@@ -101,9 +101,9 @@ class Problem(nn.Module):
                     f"Expected {name} of {type(cost).__name__} of shape ({expected},), got {tuple(given.shape)}; give "
                     "one number for each."
                 )
-        if isinstance(controls, VaryingLimits):
+        if isinstance(controls, MappedControls):
             controls = controls.of(written_system(system))
-            system, cost = in_shares(system, cost, controls, torch.zeros_like(initial_states.lower))
+            system, cost = mapped(system, cost, controls, torch.zeros_like(initial_states.lower))
         if not (system.affine or (controls.is_box and controls.limits is not None)):
             raise UsageError(
                 f"Expected limits of each control, or none, for a system that is not control-affine, got "
@@ -355,7 +355,7 @@ class Problem(nn.Module):
         name = type(system).__name__
         generator = torch.Generator().manual_seed(0)
         x = own.initial_states.sample(256, generator)
-        if isinstance(own.controls, VaryingLimits):
+        if isinstance(own.controls, MappedControls):
             own.controls.check(x, m)
         own.check_shapes(x[:TRIED])
         for contract in (*contracts_of_system(system), *contracts_of_cost(cost, m)):

@@ -143,6 +143,11 @@ class ControlSet(nn.Module, ABC):
         """The element of U that a control at x stands for: the inverse of `applied`, without its rounding."""
         return u
 
+    @property
+    def shares(self) -> "ControlSet":
+        """A set of lyapnet's own with the same elements, minimiser and projection; by default the set itself."""
+        return self
+
     def excess(self, u: Control) -> Tensor | None:
         """Smooth functions (*batch, k) of u that are ≤ 0 in U, beside its `limits`; None if there are none."""
         return None

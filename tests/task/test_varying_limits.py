@@ -9,9 +9,10 @@ from torch.testing import assert_close
 
 from lyapnet.base.errors import UsageError
 from lyapnet.task.cost import Cost, QuadraticCost, TargetCost
+from lyapnet.task.mapped_controls import written_cost, written_system
 from lyapnet.task.sets import ControlBox
 from lyapnet.task.systems import SYSTEMS
-from lyapnet.task.varying_limits import LimitTable, VaryingLimits, written_cost, written_system
+from lyapnet.task.varying_limits import LimitTable, VaryingLimits
 from tests.problems import problem_of
 
 AT, UPPER, LOWER = [-1.3, 0.1, 0.7, 2.9], [3.1, 2.7, 1.9, 0.3], [-0.2, -1.7, -2.2, -2.3]

@@ -11,7 +11,7 @@ from torch.fx import GraphModule
 from lyapnet.base.errors import ExportError
 from lyapnet.controller.controller import Controller
 from lyapnet.graphs.tracing import core_trace
-from lyapnet.task.varying_limits import VaryingLimits
+from lyapnet.task.mapped_controls import MappedControls
 
 
 class Law:
@@ -27,15 +27,15 @@ class Law:
 
     def __init__(self, controller: Controller, dtype: torch.dtype | None = None):
         self._continued = controller.law
-        self._controls = controller.controls
-        if isinstance(self._controls, VaryingLimits) and dtype is not None:
-            self._controls = self._controls.rounded_for(dtype)
         if self._continued.beyond == "error":
             raise ExportError(
                 "Expected a law after T that another language can follow, got beyond=error; take hold, receding or "
                 "riccati."
             )
         x0, constants = controller.initial_states, len(controller.system.constants)
+        self._controls = controller.controls
+        if isinstance(self._controls, MappedControls) and dtype not in (None, x0.lower.dtype):
+            self._controls = self._controls.rounded_for(dtype)
         example = (x0.center + x0.upper) / 2
         x, p = example.split([len(example) - constants, constants])
         self.arguments = {"t": torch.zeros_like(example[0]), "x": x, **({"p": p} if constants else {})}

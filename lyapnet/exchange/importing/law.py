@@ -15,8 +15,8 @@ from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.controller.controller import Controller
 from lyapnet.experiment.config import Config
 from lyapnet.loop.rollout import Rollout
+from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.problem import TRIED, Problem
-from lyapnet.task.varying_limits import VaryingLimits
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import ValuePolicy
 
@@ -101,9 +101,9 @@ def controller_of(
         UsageError: it is about a family, or V or u has another shape.
     """
     require_one_system(problem)
-    if isinstance(problem.controls, VaryingLimits):
+    if isinstance(problem.controls, MappedControls):
         raise UsageError(
-            "Expected constant limits of controls for a network of others, got some that depend on the state; take "
+            f"Expected constant limits of controls for a network of others, got {problem.controls.words}; take "
             "constant ones."
         )
     problem = copied(problem)

@@ -19,16 +19,16 @@ from lyapnet.experiment.assembly.domain import in_domain
 from lyapnet.experiment.assembly.entries import by_state, index_of, repeated, require_length, rows
 from lyapnet.experiment.assembly.family import family_of
 from lyapnet.experiment.assembly.free_controls import refuse_free_controls
+from lyapnet.experiment.assembly.mapped_controls import (
+    refuse_beside_mapped_controls,
+    require_rest_in_mapped_controls,
+    set_for_target,
+)
 from lyapnet.experiment.assembly.noise import build_noise, check_risk
 from lyapnet.experiment.assembly.outputs import estimator_parts
 from lyapnet.experiment.assembly.reference import reference_of, require_points
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
-from lyapnet.experiment.assembly.varying_limits import (
-    constant_limits,
-    refuse_beside_varying_limits,
-    require_rest_within_limits,
-)
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
 from lyapnet.task.contracts import check_shapes_of_controls, check_shapes_of_cost, check_shapes_of_system
 from lyapnet.task.cost import (
@@ -43,10 +43,10 @@ from lyapnet.task.cost import (
     TimeCost,
 )
 from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box, ControlBox, ControlSet
 from lyapnet.task.systems import ControlSystem, Linear
-from lyapnet.task.varying_limits import VaryingLimits
 
 
 def build_problem(config: Config, parts: Parts | None = None) -> Problem:
@@ -83,8 +83,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
-        if isinstance(controls, VaryingLimits):
-            refuse_beside_varying_limits(config)
+        if isinstance(controls, MappedControls):
+            refuse_beside_mapped_controls(config, controls)
             copied(controls.of(system)).check(x, system.m)
         controls = _with_control_costs(config, cost, controls, system.m)
         require_points(config.reference)
@@ -95,7 +95,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
                 config, system, cost, controls, initial_states, own_cost=parts.cost is not None
             )
         elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
-            cost = about_target(config, cost, system, constant_limits(controls), initial_states)
+            cost = about_target(config, cost, system, set_for_target(controls), initial_states)
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(
@@ -107,7 +107,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             noise=build_noise(config, system),
             risk=config.risk,
         )
-        require_rest_within_limits(problem)
+        require_rest_in_mapped_controls(problem)
         check_risk(config, problem)
         if not config.family and config.cost.name not in COSTS:
             _refuse_free_controls_of_own_cost(problem)
@@ -138,7 +138,7 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
-        return system, trim(config, system, constant_limits(controls), initial_states)
+        return system, trim(config, system, set_for_target(controls), initial_states)
 
 
 def _checked_states(system: ControlSystem, initial_states: Box) -> State:
@@ -167,7 +167,7 @@ def _refuse_free_controls(
             return
         weighted = build_cost(replace(_cost_section(config), R=1.0), system)
         controls = build_controls(config.controls, system) if controls is None else controls.double()
-        if isinstance(controls, VaryingLimits):
+        if isinstance(controls, MappedControls):
             return
         cost = about_target(config, weighted, system, controls, initial_states)
         problem = Problem(system, cost, controls, initial_states, horizon)

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain, load_config
+from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.problem import Problem
-from lyapnet.task.varying_limits import VaryingLimits
 
 # Sections of a config, and the physical control at the end of the normalised action box: the next round number above
 # the largest |u*| from 1000 states of X₀ (4.9 N, 16.0 N, 23.6 N, 2.0 N·m and 0.9 N·m), so that no optimum is cut.
@@ -86,11 +86,11 @@ def bounded_problem(
             "which learners take the mean: leave risk out."
         )
     m, names = built.system.m, ", ".join(built.system.control_labels)
-    if isinstance(built.controls, VaryingLimits):
+    if isinstance(built.controls, MappedControls):
         if scale is not None and any(bound != 1 for bound in scale):
             raise UsageError(
-                f"Expected no control_scale with limits that depend on the state, got {list(scale)}; an action is the "
-                "share of the range between them: leave it out."
+                f"Expected no control_scale with {built.controls.words}, got {list(scale)}; an action is the share of "
+                "their range: leave it out."
             )
         scale = [1.0] * m
     if scale is None:

@@ -55,7 +55,7 @@ class Known(NamedTuple):
 
 def description(costs: ControlCosts | None, controls: ControlSet) -> str | None:
     """All that defines s and U, as text; None if a class is not lyapnet's own."""
-    parts = [] if costs is None else [*costs.costs]
+    parts, controls = [] if costs is None else [*costs.costs], controls.shares
     own = {*CONTROL_COSTS.values()}.issuperset(map(type, parts)) and type(costs) in (ControlCosts, type(None))
     if not own or type(controls) not in (ControlBall, ControlBox, Unbounded) or (costs and float(costs.softness)):
         return None
@@ -90,7 +90,7 @@ def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
     """The description of s and U, by which the operator finds them in this process; None if it has none."""
     named = description(costs, controls)
     if named is not None and named not in _known:
-        _known[named] = {_CPU: Known(costs, controls).to(_CPU)}
+        _known[named] = {_CPU: Known(costs, controls.shares).to(_CPU)}
     return named
 
 

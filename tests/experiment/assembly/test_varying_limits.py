@@ -124,7 +124,7 @@ def compiled_in(folder, own, dtype):
 def test_limits_of_a_users_own_are_not_written_in_another_precision(tmp_path):
     own = controller(controls={"name": f"{__name__}:OfAngle"})
     export(own, tmp_path / "law", "c")
-    with pytest.raises(ExportError, match=r"Expected limits of controls from a table, .+, got OfAngle: .+; .+"):
+    with pytest.raises(ExportError, match=r"Expected a control set of lyapnet's own, .+, got OfAngle: .+; .+"):
         export(own, tmp_path / "other", "c", dtype="float32")
 
 
@@ -162,7 +162,7 @@ def test_a_target_is_held_within_the_limits_there():
     own = problem(target={"angle": 0.5})
     held = own.controls.applied(own.goal, own.rest)
     assert_close(Pendulum().dynamics(own.goal, held), torch.zeros(2))
-    with pytest.raises(UsageError, match=r"Expected limits of controls that admit .+, got .+ there; .+"):
+    with pytest.raises(UsageError, match=r"Expected the control at the target, .+, got it outside .+ there; .+"):
         problem(target={"angle": 1.2})
 
 
@@ -186,7 +186,7 @@ def test_what_does_not_go_with_them_is_refused(sections, words):
 
 def test_estimators_and_sontags_law_are_refused():
     own = controller()
-    with pytest.raises(UsageError, match=r"Expected constant limits .+, got some .+; .+"):
+    with pytest.raises(UsageError, match=r"Expected constant limits .+, got limits that depend on the state; .+"):
         own.with_estimator(measure=["angle"], noise=0.1)
     with pytest.raises(ValueError, match=r"Expected controls without limits .+, got LimitTable; .+"):
         SontagPolicy(own.problem, own.V)

@@ -1,11 +1,13 @@
 """The ball ‖u‖ ≤ r as a set of controls, and the minimiser of a quadratic cost and ‖u‖ in it."""
 
+import copy
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply, norm, solve
-from lyapnet.base.types import Control, ControlMatrix
+from lyapnet.base.types import Control, ControlMatrix, State
 from lyapnet.task.sets import ControlSet
 
 NEWTON_STEPS = 10  # for a multiplier: they converge from one side, and double its digits at each step
@@ -48,9 +50,19 @@ class ControlBall(ControlSet):
     def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
         return (u.double() ** 2).sum(-1) <= self.radius.double() ** 2
 
+    def rounded_for(self, dtype: torch.dtype) -> ControlSet:
+        return copy.deepcopy(self).to(dtype).to(self.radius.dtype)
+
+    def applied(self, x: State, u: Control) -> Control:
+        return self._inwards(u, self.rounding) if self.rounding > torch.finfo(u.dtype).eps else u
+
     def project(self, u: Control) -> Control:
         """u, or r u/‖u‖ up to rounding, which is inwards."""
-        rounding = INWARDS * torch.finfo(u.dtype).eps
+        return self._inwards(u, torch.finfo(u.dtype).eps)
+
+    def _inwards(self, u: Control, unit: float) -> Control:
+        """The same for a unit of rounding."""
+        rounding = INWARDS * unit
         within = self.radius * (1 - rounding)
         if u.shape[-1] == 1:
             return u.clamp(-within, within)

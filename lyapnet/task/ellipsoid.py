@@ -1,7 +1,6 @@
 """An ellipsoid as a set of controls: a ball, stretched, turned and moved."""
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -55,14 +54,7 @@ class ControlEllipsoid(MappedControls, ControlBall):
         # how far, in v, the rounding of u may move it, in units of rounding
         norm = torch.linalg.matrix_norm
         self.spread: float = float(norm(self.inverse) * (norm(H) + c.norm()))
-        self.rounding: float = torch.finfo(torch.float64).eps
         self.to(torch.get_default_dtype())
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ControlEllipsoid":
-        super()._apply(fn, recurse)
-        if hasattr(self, "rounding"):
-            self.rounding = max(self.rounding, torch.finfo(self.shape.dtype).eps)
-        return self
 
     @property
     def shares(self) -> ControlBall:
@@ -75,9 +67,6 @@ class ControlEllipsoid(MappedControls, ControlBall):
                 f"{len(self.center)}; give a radius for each."
             )
         return self
-
-    def rounded_for(self, dtype: torch.dtype) -> "ControlEllipsoid":
-        return copy.deepcopy(self).to(dtype).to(self.shape.dtype)
 
     @property
     def fixed_limits(self) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.base.errors import ExportError, UsageError
+from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, State
 from lyapnet.task.cost import Cost, MadeOfAnother
 from lyapnet.task.extended_system import ExtendedSystem
@@ -43,17 +43,6 @@ class MappedControls(ControlSet):
             UsageError: it does not fit the system.
         """
         return self
-
-    def rounded_for(self, dtype: torch.dtype) -> "MappedControls":
-        """This set for arithmetic in another precision, in which it is not left; in that of its buffers.
-
-        Raises:
-            ExportError: it is not known to be rounded inwards.
-        """
-        raise ExportError(
-            f"Expected a control set of lyapnet's own, or the precision of the controller, got {type(self).__name__}: "
-            "in another precision u may leave it; take --dtype of the controller."
-        )
 
     def check(self, x: State, m: int) -> None:
         """Check the set of m controls at states (b, n).

@@ -108,6 +108,18 @@ class ControlSet(nn.Module, ABC):
     buffers, so that they follow the problem's precision and device, and identify the set in caches.
     """
 
+    rounding: float = torch.finfo(torch.float64).eps  # of the coarsest precision that its buffers have had
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ControlSet":
+        super()._apply(fn, recurse)
+        units = [torch.finfo(each.dtype).eps for each in self.buffers() if each.is_floating_point()]
+        self.rounding = max(self.rounding, *units, 0.0)
+        return self
+
+    def rounded_for(self, dtype: torch.dtype) -> "ControlSet":
+        """This set for arithmetic in another precision, in which `applied` does not leave it; by default the set."""
+        return self
+
     @property
     def limited(self) -> bool:
         """Whether U is smaller than ℝᵐ."""
@@ -136,7 +148,7 @@ class ControlSet(nn.Module, ABC):
         return self.limits
 
     def applied(self, x: State, u: Control) -> Control:
-        """The control that acts at x for an element u of U: u itself, unless U has shares of limits that vary."""
+        """The control that acts at x for an element u of U: u itself, unless U has shares, or a coarser rounding."""
         return u
 
     def asked(self, x: State, u: Control) -> Control:

@@ -2,7 +2,7 @@
 
 import copy
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.base.contracts import check_function
-from lyapnet.base.errors import UsageError
+from lyapnet.base.errors import ExportError, UsageError
 from lyapnet.base.types import Control, State
 from lyapnet.task.mapped_controls import MappedControls, finite_numbers
 from lyapnet.task.sets import ControlBox
@@ -39,6 +39,17 @@ class VaryingLimits(MappedControls, ControlBox):
     @abstractmethod
     def limits_at(self, x: State) -> tuple[Control, Control]:
         """(lower, upper), each (*batch, m), finite and lower < upper."""
+
+    def rounded_for(self, dtype: torch.dtype) -> "VaryingLimits":
+        """See ControlSet.rounded_for.
+
+        Raises:
+            ExportError: nothing is known of the rounding of `limits_at`.
+        """
+        raise ExportError(
+            f"Expected limits of controls from a table, or the precision of the controller, got "
+            f"{type(self).__name__}: in another precision u may pass them; take --dtype of the controller."
+        )
 
     def moved(self, x: State, u: Control) -> Control:
         lower, upper = self.limits_at(x)
@@ -113,7 +124,6 @@ class LimitTable(VaryingLimits):
         self.state = state
         self.index: int | None = None  # of the state in the system
         self.count = 1  # number of controls
-        self.rounding = torch.finfo(torch.float64).eps  # unit of rounding of the coarsest precision it has had
         nodes, top = finite_numbers("at", at), finite_numbers("upper", upper)
         bottom = -top if lower is None else finite_numbers("lower", lower)
         if nodes.ndim != 1 or len(nodes) < 2 or not bool((nodes.diff() > 0).all()):
@@ -135,11 +145,6 @@ class LimitTable(VaryingLimits):
         }.items():  # fmt: skip
             self.register_buffer(name, table.clone(), persistent=False)
         self.to(torch.get_default_dtype())
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "LimitTable":
-        super()._apply(fn, recurse)
-        self.rounding = max(self.rounding, torch.finfo(self.first.dtype).eps)
-        return self
 
     def of(self, system: ControlSystem) -> "LimitTable":
         names = [*system.state_names]

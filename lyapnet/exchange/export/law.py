@@ -11,7 +11,6 @@ from torch.fx import GraphModule
 from lyapnet.base.errors import ExportError
 from lyapnet.controller.controller import Controller
 from lyapnet.graphs.tracing import core_trace
-from lyapnet.task.mapped_controls import MappedControls
 
 
 class Law:
@@ -34,7 +33,7 @@ class Law:
             )
         x0, constants = controller.initial_states, len(controller.system.constants)
         self._controls = controller.controls
-        if isinstance(self._controls, MappedControls) and dtype not in (None, x0.lower.dtype):
+        if dtype not in (None, x0.lower.dtype):
             self._controls = self._controls.rounded_for(dtype)
         example = (x0.center + x0.upper) / 2
         x, p = example.split([len(example) - constants, constants])

@@ -1,10 +1,13 @@
 """Exported laws of tasks with other costs of controls than uᵀRu, and with a ball."""
 
+import numpy as np
 import pytest
 import torch
 
 from lyapnet.controller.controller import Controller
 from lyapnet.exchange.export import export
+from lyapnet.exchange.export.c import FLAGS, NAME, CompiledLaw, Style
+from lyapnet.exchange.export.law import Law
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.value.calculus import ValueFunction
@@ -37,6 +40,27 @@ def controller(request):
         "initial_states": {"lower": -1, "upper": 1}, "horizon": {"steps": 10, "dt": 0.1},
     }  # fmt: skip
     return Controller(build_problem(config_from_plain(plain)), Bowl(), policy=SampledPolicy)
+
+
+@pytest.mark.parametrize("radius", [2.0, 0.3])
+def test_a_ball_is_not_left_in_single_precision(radius, tmp_path):
+    plain = {
+        "experiment": "x", "system": {"name": "rocket"}, "cost": {"Q": 1, "R": 0.1, "Q_T": 10},
+        "controls": {"name": "ball", "parameters": {"radius": radius}},
+        "initial_states": {"lower": -1, "upper": 1}, "horizon": {"steps": 10, "dt": 0.1},
+    }  # fmt: skip
+    own = Controller(build_problem(config_from_plain(plain)), Bowl(), policy=SampledPolicy)
+    export(own, tmp_path / "law", "c", dtype="float32")
+    law = CompiledLaw(tmp_path / "law", Law(own), 2, FLAGS, Style(NAME, torch.float32), None)
+    u = law.of_many(np.zeros(2000), torch.randn(2000, 4).numpy())[0].astype(np.longdouble)
+    size = np.sqrt((u**2).sum(1))
+    assert (size <= radius).all()
+    assert (size > (1 - 1e-5) * radius).any(), "its border"
+    own.controls.rounded_for = lambda dtype: own.controls  # as before
+    export(own, tmp_path / "other", "c", dtype="float32")
+    law = CompiledLaw(tmp_path / "other", Law(own), 2, FLAGS, Style(NAME, torch.float32), None)
+    u = law.of_many(np.zeros(2000), torch.randn(2000, 4).numpy())[0].astype(np.longdouble)
+    assert (np.sqrt((u**2).sum(1)) > radius).any()
 
 
 @pytest.mark.gate

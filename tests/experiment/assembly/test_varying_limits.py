@@ -124,7 +124,7 @@ def compiled_in(folder, own, dtype):
 def test_limits_of_a_users_own_are_not_written_in_another_precision(tmp_path):
     own = controller(controls={"name": f"{__name__}:OfAngle"})
     export(own, tmp_path / "law", "c")
-    with pytest.raises(ExportError, match=r"Expected a control set of lyapnet's own, .+, got OfAngle: .+; .+"):
+    with pytest.raises(ExportError, match=r"Expected limits of controls from a table, .+, got OfAngle: .+; .+"):
         export(own, tmp_path / "other", "c", dtype="float32")
 
 

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     )
     from lyapnet.task.ellipsoid import ControlEllipsoid
     from lyapnet.task.horizon import Horizon
+    from lyapnet.task.polytope import ControlPolytope
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
     from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem
@@ -88,6 +89,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "controller.output_feedback": ["OutputFeedback"],
     "value.policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
     "task.horizon": ["Horizon"],
+    "task.polytope": ["ControlPolytope"],
     "task.problem": ["Problem"],
     "loop.programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
     "loop.rollout": ["Rollout", "Trajectory"],
@@ -119,6 +121,7 @@ __all__ = [
     "ControlCost",
     "ControlCosts",
     "ControlEllipsoid",
+    "ControlPolytope",
     "ControlSet",
     "ControlSystem",
     "Controller",

@@ -11,7 +11,8 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, multiply
 from lyapnet.base.types import Control, State
 from lyapnet.task.ball import ControlBall
-from lyapnet.task.mapped_controls import MappedControls, finite_numbers
+from lyapnet.task.mapped_controls import MappedControls
+from lyapnet.task.sets import finite_numbers
 from lyapnet.task.systems import ControlSystem
 
 ROUNDING = 16  # units of rounding by which controls are inside, relative to the condition of H and the size of c

@@ -10,9 +10,7 @@ the set has the minimiser of the simpler one.
 
 import copy
 from abc import abstractmethod
-from typing import Any
 
-import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
@@ -144,18 +142,3 @@ def written_cost(cost: Cost) -> Cost:
     cost._modules = {**cost._modules, "cost": inner}
     cost._buffers = {**cost._buffers, **{name: getattr(inner, name) for name in ("rest", "R_constant", "R_inverse")}}
     return cost
-
-
-def finite_numbers(name: str, given: Any) -> Tensor:
-    """Finite numbers in float64, from nested lists of them.
-
-    Raises:
-        ValueError: they are none; names them.
-    """
-    try:
-        numbers = torch.tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"Expected {name} as a list of numbers, got {given!r}; write it so.") from error
-    if not numbers.numel() or not bool(numbers.isfinite().all()):
-        raise ValueError(f"Expected finite numbers as {name}, got {given!r}; correct them.")
-    return numbers

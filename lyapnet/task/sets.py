@@ -4,6 +4,7 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -180,6 +181,21 @@ class ControlSet(nn.Module, ABC):
     @abstractmethod
     def project(self, u: Control) -> Control:
         """The point of U closest to each control."""
+
+
+def finite_numbers(name: str, given: Any) -> Tensor:
+    """Finite numbers in float64, from nested lists of them.
+
+    Raises:
+        ValueError: they are none; names them.
+    """
+    try:
+        numbers = torch.tensor(given, dtype=torch.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"Expected {name} as a list of numbers, got {given!r}; write it so.") from error
+    if not numbers.numel() or not bool(numbers.isfinite().all()):
+        raise ValueError(f"Expected finite numbers as {name}, got {given!r}; correct them.")
+    return numbers
 
 
 def about_control(R: ControlMatrix, b: Control, center: Tensor | None) -> Control:

@@ -12,8 +12,8 @@ from torch import Tensor
 from lyapnet.base.contracts import check_function
 from lyapnet.base.errors import ExportError, UsageError
 from lyapnet.base.types import Control, State
-from lyapnet.task.mapped_controls import MappedControls, finite_numbers
-from lyapnet.task.sets import ControlBox
+from lyapnet.task.mapped_controls import MappedControls
+from lyapnet.task.sets import ControlBox, finite_numbers
 from lyapnet.task.systems import ControlSystem
 
 TRIED = 64  # states at which a user's function is tested

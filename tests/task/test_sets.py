@@ -15,6 +15,7 @@ from lyapnet.task.ball import ControlBall
 from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.ellipsoid import ControlEllipsoid
+from lyapnet.task.polytope import ControlPolytope
 from lyapnet.task.sets import Box, ControlBox, Unbounded
 from lyapnet.task.varying_limits import LimitTable
 from tests.marks import at_the_gate
@@ -142,7 +143,9 @@ def test_only_the_unbounded_set_itself_has_no_limits():
 
 SETS = {
     **CONTROL_SETS, "box": lambda: ControlBox([-0.3, -0.1], [0.1, 0.4]), "ball": lambda: ControlBall(0.3),
-    "ellipsoid": lambda: ControlEllipsoid([0.4, 0.2], [0.1, 0.0]), "table": lambda: LimitTable("x", [0, 1], [2, 1]),
+    "ellipsoid": lambda: ControlEllipsoid([0.4, 0.2], [0.1, 0.0]),
+    "polytope": lambda: ControlPolytope([[1, 1], [-1, 0], [0, -1]], [0.3, 0.2, 0.1]),
+    "table": lambda: LimitTable("x", [0, 1], [2, 1]),
 }  # fmt: skip
 
 

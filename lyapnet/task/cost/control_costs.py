@@ -14,6 +14,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, has_values, norm
 from lyapnet.base.types import Control, ControlMatrix, PerState
 from lyapnet.task.ball import LEAST_NUMBER, ControlBall, minimise_in_ball, positive_number
+from lyapnet.task.polytope import ControlPolytope
 from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
 NEWTON_STEPS = 12  # of the minimiser with smooth costs, in traces
@@ -464,6 +465,8 @@ def local_shape(
     one = u.shape[-1] == 1  # a ball is a box, and a norm is |u|
     if not one and (isinstance(controls, ControlBall) or _norm_of(cost) is not None):
         return _shape_in_ball(cost, controls, u, slope)
+    if isinstance(controls, ControlPolytope):  # no other cost goes with it
+        return controls.tangents(u), None
     parts = [] if cost is None else cost.separable
     whole = slope + sum((part.slope(u) for part in parts), torch.zeros_like(u))
     if (weight := _norm_of(cost)) is not None:

@@ -13,6 +13,7 @@ from lyapnet.base.operators import MINIMA, are_operators, is_transformed
 from lyapnet.base.types import Control, ControlMatrix, PerState
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost.control_costs import CONTROL_COSTS, ControlCosts
+from lyapnet.task.polytope import ControlPolytope
 from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
 
@@ -36,8 +37,8 @@ def least_over(costs: ControlCosts | None, controls: ControlSet, W: ControlMatri
 
 
 def is_quadratic_between_limits(costs: ControlCosts | None, controls: ControlSet) -> bool:
-    """Whether no s is paid and U is no ball, so that bounds read the best control as it is written."""
-    return costs is None and not isinstance(controls, ControlBall)
+    """Whether no s is paid and U is neither ball nor polytope, so that bounds read the best control as written."""
+    return costs is None and not isinstance(controls, ControlBall | ControlPolytope)
 
 
 class Known(NamedTuple):

@@ -11,6 +11,7 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts, LogCosCost, NormCost, PowerCost
 from lyapnet.task.ellipsoid import ControlEllipsoid
 from lyapnet.task.horizon import Horizon
+from lyapnet.task.polytope import ControlPolytope
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlBox, Unbounded
 from lyapnet.task.systems import Linear, Pendulum
@@ -46,6 +47,7 @@ CASES = {
     ),
     "a thruster": lambda: problem_with([AbsoluteCost(0.3)], ControlBox([0.0, -1.0], [1.0, 0.0])),
     "ellipsoid": lambda: problem_with(None, ControlEllipsoid([[1.2, 0.3], [0.0, 0.7]], [0.1, -0.2])),
+    "polytope": lambda: problem_with(None, ControlPolytope([[1, 1], [-1, 0], [0, -1], [1, -2]], [1.0, 0.8, 1.0, 1.2])),
     "limits that fall with speed": lambda: problem_with(None, falling(), Pendulum()),
     "limits that fall with speed, rk4": lambda: problem_with(None, falling(), Pendulum(), method="rk4"),
     "log-cos": lambda: problem_with([LogCosCost(0.05, 4.0)], ControlBox(-3.9999, 3.9999), Pendulum()),

@@ -73,6 +73,8 @@ class Evaluation(NamedTuple):
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
         limits = self.table.use_of_limits(system.control_names)
         used: dict[str, Any] = {"at_limits": limits} if limits else {}
+        if (border := self.table.at_border) is not None:
+            used["at_border"] = {"steps": float(border.mean()), "states": float((border > 0).double().mean())}
         if self.table.violated is not None:
             used["violated_fraction"] = float(self.table.violated.double().mean())
             used["constraints"] = self.table.violations(names_of(self.problem.constraints))

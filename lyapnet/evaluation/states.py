@@ -36,6 +36,7 @@ class StateTable:
     terminal_state: State  # x_N
     terminal_error: PerState  # ‖x_N − goal‖
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
+    at_border: Tensor | None = None  # (b,): share of the steps on the border of a set of controls that is no box
     worst: Tensor | None = None  # (b, k): max_n h(x_n); None without constraints
     worst_time: Tensor | None = None  # (b, k): time of this maximum
     left: Tensor | None = None  # (b,) bool: whether the closed loop leaves the domain; None without a domain
@@ -167,6 +168,7 @@ def measure(
         terminal_state=trajectory.x[-1],
         terminal_error=torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1),
         at_limits=_at_limits(problem.controls, trajectory.u),
+        at_border=_at_border(problem.controls, trajectory.u),
         worst=worst,
         worst_time=worst_time,
         arrival=_arrival(problem, trajectory),
@@ -207,6 +209,11 @@ def _at_limits(controls: ControlSet, u: ControlPath) -> Tensor | None:
     if not controls.is_box:
         return None
     return torch.stack([(u == limit.to(u)).to(u).mean(0) for limit in controls.limits], 1)
+
+
+def _at_border(controls: ControlSet, u: ControlPath) -> Tensor | None:
+    holds = controls.at_border(u)
+    return None if holds is None else holds.to(u).mean(0)
 
 
 def _share(holds: Tensor) -> float:

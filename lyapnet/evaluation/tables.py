@@ -62,6 +62,11 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
             f"{name} at its lower, upper limit: share of steps (of states that meet one)",
             f"{share['lower']:.1%}, {share['upper']:.1%} ({share['states']:.0%})",
         )
+    if border := result.get("at_border"):
+        table.add_row(
+            "controls on the border of their set: share of steps (of states that meet it)",
+            f"{border['steps']:.1%} ({border['states']:.0%})",
+        )
     for name, found in result.get("constraints", {}).items():
         table.add_row(f"{name}: greatest h, when", f"{found['worst']:.4g}, {found['time']:.4g} s")
     if corner := result.get("worst_corner"):  # since version 0.3

@@ -139,7 +139,8 @@ def _mean_of_dearest(J: Tensor) -> PerState:
     return (J.sort(0, descending=True).values[: len(share)] * share[:, None]).sum(0) / count
 
 
-AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits")  # columns of a table that are averaged over paths
+# columns of a table that are averaged over paths
+AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits", "at_border")
 
 
 def average(tables: Sequence[StateTable]) -> StateTable:

@@ -165,6 +165,11 @@ class ControlSet(nn.Module, ABC):
         """Smooth functions (*batch, k) of u that are ≤ 0 in U, beside its `limits`; None if there are none."""
         return None
 
+    def at_border(self, u: Control) -> Bool[Tensor, "*batch"] | None:
+        """Whether each control is on the border that its `excess` describes; None if there is none."""
+        excess = self.excess(u)
+        return None if excess is None else (excess >= -NEAR_BORDER).any(-1)
+
     @abstractmethod
     def minimise(self, R: ControlMatrix, b: Control) -> Control:
         """argmin over u ∈ U of uᵀRu + bᵀu, (*batch, m): the control law, with b = gᵀV_x.
@@ -455,4 +460,5 @@ def _have_values(*tensors: Tensor) -> bool:
 ENUMERATED_CONTROLS = 4  # up to this number all combinations are tried: 3⁴ = 81 systems compile faster than many rounds
 ACTIVE_SET_ROUNDS = 4  # rounds of the active-set method for each control
 SIMULTANEOUS_ROUNDS = 8  # rounds in which all controls may change at once; as many for each control follow
+NEAR_BORDER = 1e-5  # excess below which a control is inside; on a border it is 0 up to rounding, also in float32
 FINITE_LIMIT = 1e150  # replaces an infinite limit in products

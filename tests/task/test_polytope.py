@@ -9,14 +9,17 @@ from scipy.optimize import minimize
 from torch.testing import assert_close
 
 from lyapnet.base.errors import UsageError
+from lyapnet.claims.certify import certify
+from lyapnet.claims.kinds import Funnel, Region, Tube
 from lyapnet.controller.controller import Controller
+from lyapnet.evaluation.measurement import evaluate
 from lyapnet.exchange.export import export
 from lyapnet.exchange.export.c import FLAGS, NAME, CompiledLaw, Style
 from lyapnet.exchange.export.law import Law
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.polytope import ControlPolytope
-from lyapnet.value.policy import SampledPolicy
+from lyapnet.value.policy import HJBPolicy, SampledPolicy
 from tests.task.test_ellipsoid import Bowl
 
 A, B = [[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, -1.0], [-1.0, 3.0]], [1.5, 1.0, 0.7, 2.0, 3.1]
@@ -141,7 +144,30 @@ def test_a_polytope_without_meaning_is_refused(rows, sides, words):
         ControlPolytope(rows, sides)
 
 
+def test_the_evaluation_says_how_often_controls_are_on_its_border():
+    plane = {"A": [[0, 0, 1, 0], [0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 0, 0]], "B": [[0, 0], [0, 0], [1, 0], [0, 1]]}
+    near = {**PLAIN, "system": {"name": "linear", "parameters": plane}}
+    own = Controller(build_problem(config_from_plain(near)), Bowl(), policy=SampledPolicy)
+    border = evaluate(own, samples=20, optimum=False)["at_border"]
+    assert 0 < border["steps"] < border["states"] <= 1
+    u = own.controls.inner + torch.tensor([[0.0, 0.0], [1e-3, 0.0]])
+    assert not bool(own.controls.at_border(u).any())
+    assert bool(own.controls.at_border(own.controls.project(100 * torch.randn(50, 2))).all())
+    wide = {**near, "horizon": {"steps": 10, "dt": 0.01}, "controls": {"name": "ball", "parameters": {"radius": 1e6}}}
+    inside = Controller(build_problem(config_from_plain(wide)), Bowl(), policy=SampledPolicy)
+    assert evaluate(inside, samples=20, optimum=False)["at_border"] == {"steps": 0, "states": 0}
+
+
 def test_what_does_not_know_it_refuses_it():
     plain = {**PLAIN, "cost": {**PLAIN["cost"], "control_costs": [{"name": "norm", "weight": 1}]}}
     with pytest.raises(UsageError, match=r"Expected costs of controls .+ in ControlPolytope, got NormCost; .+"):
         build_problem(config_from_plain(plain))
+    own = Controller(build_problem(config_from_plain(PLAIN)), Bowl(), policy=HJBPolicy)
+    for claim in (Funnel(), Region(), Tube()):
+        with pytest.raises(UsageError, match=r"Expected .+ certificate, got uᵀRu in ControlPolytope; .+"):
+            certify(own, claim)
+    pytest.importorskip("casadi")
+    from lyapnet.lab.comparison.planners.mpc import PredictiveControl
+
+    with pytest.raises(UsageError, match=r"Expected limits and uᵀRu alone for MPC, got .+; .+"):
+        PredictiveControl(own.problem, 20)

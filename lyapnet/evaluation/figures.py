@@ -172,7 +172,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     t = numpy_of(trajectory.t)
     drawn, controls = states_and_controls_to_draw(system)
     goals, rests = trajectory.x - problem.cost.from_goal(trajectory.x), problem.rest_at(trajectory.x[:-1])
-    rests = problem.controls.applied(trajectory.x[:-1], rests)
+    rests = problem.controls.moved(trajectory.x[:-1], rests)
     wanted = [numpy_of(goals[..., i]) if problem.has_goal else None for i in drawn]
     wanted += [numpy_of(rests[..., i]) for i in controls]
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]

@@ -89,7 +89,7 @@ class Picture:
 
 def set_stage(panel: Axes, problem: Problem, corners: np.ndarray) -> None:
     """Set the view of a panel in metres so that it contains the points (k, 2); draw the shapes of the goal in red."""
-    rest = numpy_of(problem.controls.applied(problem.goal, problem.rest))
+    rest = numpy_of(problem.controls.moved(problem.goal, problem.rest))
     goal = shapes_of(problem, numpy_of(problem.goal), rest) if problem.has_goal else []
     corners = np.concatenate([corners, *map(corners_of, goal)])
     low, high = corners.min(0), corners.max(0)

@@ -152,8 +152,12 @@ class ControlSet(nn.Module, ABC):
         """The control that acts at x for an element u of U: u itself, unless U has shares, or a coarser rounding."""
         return u
 
+    def moved(self, x: State, u: Control) -> Control:
+        """The same for an element of ℝᵐ, without rounding; affine in u."""
+        return u
+
     def asked(self, x: State, u: Control) -> Control:
-        """The element of U that a control at x stands for: the inverse of `applied`, without its rounding."""
+        """The element of ℝᵐ that a control at x stands for: the inverse of `moved`."""
         return u
 
     @property

@@ -291,8 +291,8 @@ def _system_fact(problem: Problem) -> Fact:
     limits = ""
     if controls.limited:
         limits = f" in {controls}"
-        if controls.limits is not None and controls.is_box:
-            low, high = (side.expand(system.m) for side in controls.limits)
+        if controls.fixed_limits is not None and controls.is_box:
+            low, high = (side.expand(system.m) for side in controls.fixed_limits)
             rows = zip(system.control_names, system.control_units, low.tolist(), high.tolist(), strict=True)
             limits = f" between {_format_vector(low)} and {_format_vector(high)}"
             if system.m <= NAMED_CONTROLS:
@@ -323,13 +323,11 @@ def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) 
     rounding = max(HELD, ROUNDING_UNITS * torch.finfo(precision).eps)
     goal, system = problem.goal, problem.system
     f, rest = around.f, system.dynamics(goal, problem.rest)
-    where = f"{_format_vector(goal)}, " if goal.any() else ""
+    where, held = f"{_format_vector(goal)}, " if goal.any() else "", problem.controls.moved(goal, problem.rest)
     if not bool(problem.controls.contains(problem.rest)):
-        return Fact(
-            "goal", f"{where}u = {_format_vector(problem.rest)} is beyond its limits", "the cost has no rest there"
-        )
+        return Fact("goal", f"{where}u = {_format_vector(held)} is beyond its limits", "the cost has no rest there")
     if float(rest.abs().max()) <= rounding * max(1.0, float(f.abs().max())):
-        control = f"at u = {_format_vector(problem.rest)}" if problem.rest.any() else "without control"
+        control = f"at u = {_format_vector(held)}" if held.any() else "without control"
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
     if float(left.abs().max()) <= rounding * float(f.abs().max()):
@@ -338,6 +336,7 @@ def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) 
             remedy += ", so that staying costs nothing"
         if problem.cost.rest is not None:  # target_control says from where
             remedy = ""
+        u = problem.controls.moved(goal, u)
         return Fact("goal", f"{where}held by u = {_format_vector(u)}, which the cost charges", remedy)
     return Fact(
         "goal",

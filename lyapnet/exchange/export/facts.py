@@ -40,7 +40,7 @@ def facts_of(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
     if problem.follows_reference:
         facts["target"] = "a reference"
     elif problem.has_goal:
-        goal, rest = problem.goal.tolist(), problem.controls.applied(problem.goal, problem.rest).tolist()
+        goal, rest = problem.goal.tolist(), problem.controls.moved(problem.goal, problem.rest).tolist()
         held = _values(system.control_names, system.control_units, rest, range(system.m))
         facts["target"] = f"{_values(names, units, goal, states)}; held by {held}"
     held = "; u is made to be held for it" if controller.law.held else ""

@@ -17,6 +17,7 @@ from lyapnet.prover.readings import Readings
 from lyapnet.task.noise import StateNoise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
+from lyapnet.task.varying_limits import VaryingLimits
 
 COMPARED = 1000  # random states of X₀: their mean running cost sets δ, and their costs are compared with optima
 
@@ -56,21 +57,28 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
     """When the law is read, and how far this may be off; None for a claim about u read at every t.
 
     Args:
-        made_for: "continuous" or "held", if the claim does not say it.
+        made_for: "continuous" or "held", if the claim does not say it; continuous where no held law is covered.
         forever: whether the law is read as u(0, x).
 
     Raises:
-        UsageError: options of a held law for one that is read at every t, a name is unknown, or there are constraints.
+        UsageError: options of a held law for one that is read at every t, a name is unknown, there are constraints, or
+            limits depend on the state.
     """
     problem, system = controller.problem, controller.system
     given = [name for name in ("interval", "jitter", "delay", "measured", "quantised") if getattr(claim, name)]
-    time = claim.time or ("held" if given else made_for)
+    covered = problem.constraints is None and not isinstance(problem.controls, VaryingLimits)
+    time = claim.time or ("held" if given or (made_for == "held" and covered) else "continuous")
     if time == "continuous":
         if given:
             raise UsageError(f"Expected --time held with --{given[0]}, got continuous; u is then read at every t.")
         return None
     if problem.constraints is not None:
         raise UsageError("Expected no state constraints for a law that is held, got some; add --time continuous.")
+    if isinstance(problem.controls, VaryingLimits):
+        raise UsageError(
+            "Expected limits that do not depend on the state for a law that is held, got some that do; between two "
+            "readings u would follow them. Add --time continuous."
+        )
     errors = _of_states("the error", claim.measured or {}, controller)
     constant = [system.state_names[i] for i in system.constants if errors[i]]
     if constant:

@@ -103,7 +103,7 @@ def require_written_law(loop: ClosedLoop, claim: str) -> None:
         return
     raise UsageError(
         f"Expected controls that cost uᵀRu, without limits or between them, for a {claim} certificate, got "
-        f"{_in_words(policy)}; a sound certificate takes it, and a statistical one."
+        f"{_in_words(policy)}; a statistical certificate takes them, a sound one those that it knows."
     )
 
 

@@ -122,7 +122,8 @@ class ReadAtTimes(Claim):
 class Funnel(ReadAtTimes):
     """A funnel that no closed loop leaves up to T, and a bound of the cost from each state in it: proved.
 
-    Without `time` it is about a held law if the law is made to be held and there are no state constraints.
+    Without `time` it is about a held law if the law is made to be held, and there are neither state constraints nor
+    limits that depend on the state.
     lyapnet.claims.funnel.ProvedFunnel states the conditions.
     """
 
@@ -150,12 +151,12 @@ class Funnel(ReadAtTimes):
         from lyapnet.claims.sound_certificate import SoundCertificate
 
         require_goal(controller.problem, self.kind)
-        held = controller.closed_loop.policy.held and controller.problem.constraints is None
+        made_for = "held" if getattr(controller.closed_loop.policy, "held", False) else "continuous"
         found = prove_funnel(
             controller.closed_loop, controller.problem, self.alpha, slack_of(self.delta, controller),
             box_of(self.states), run.budget, run.generator, run.report, run.keep, degree=DEGREE if run.two_sided else 2,
             disturbance=disturbance_of(self.disturbance, controller),
-            readings=readings_of(self, controller, "held" if held else "continuous"),
+            readings=readings_of(self, controller, made_for),
         )  # fmt: skip
         return SoundCertificate(controller, found, run.options(self))
 

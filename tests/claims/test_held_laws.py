@@ -24,6 +24,7 @@ from lyapnet.prover.readings import Readings
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Linear
+from lyapnet.task.varying_limits import VaryingLimits
 from lyapnet.value.policy import HJBPolicy, SampledPolicy
 from tests.claims import planted
 from tests.claims.held_loops import held_loops
@@ -132,6 +133,19 @@ def test_constraints_need_a_law_that_is_read_at_every_t():
     made = Controller(limited, Formula(lambda t, x: (x**2).sum(-1) + 0 * t), policy=HJBPolicy)
     with pytest.raises(UsageError, match="Expected no state constraints for a law that is held, got some"):
         certify(made, Funnel(delay=0.1))
+
+
+def test_limits_that_follow_the_state_need_a_law_that_is_read_at_every_t():
+    class Falling(VaryingLimits):
+        def limits_at(self, x):
+            room = 2 + 0.1 * x.cos()
+            return -room, room
+
+    about = problem_of(Linear([[0.0]], [[1.0]]), steps=20, controls=Falling())
+    made = Controller(about, Formula(lambda t, x: (x**2).sum(-1) + 0 * t), policy=SampledPolicy)
+    with pytest.raises(UsageError, match="Expected limits that do not depend on the state for a law that is held"):
+        certify(made, Funnel(delay=0.1))
+    assert "read_within" not in certify(made, Funnel(alpha=ALPHA, delta=0.1), budget=2).result
 
 
 def test_a_kept_proof_is_of_its_readings(tmp_path):

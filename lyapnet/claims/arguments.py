@@ -9,8 +9,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import State
-from lyapnet.claims.claim import sides_of
-from lyapnet.claims.kinds import ReadAtTimes
+from lyapnet.claims.claim import ReadAtTimes, sides_of
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.readings import Readings

@@ -318,3 +318,28 @@ def sides_of(states: Any) -> tuple[list[float], list[float]]:
             "[[-1.6, -2.6], [1.6, 2.6]]."
         ) from error
     return lower, upper
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadAtTimes(Claim):
+    """A claim about u read at every t, or at times and held between them, with a delay and errors."""
+
+    time: str | None = option(
+        None, "When u is read: continuous, at every t; or held, each Δt.", metavar="WHEN", check=check_reading
+    )  # fmt: skip
+    interval: float | None = option(
+        None, "Seconds between two readings of u; Δt if none.", above=0, remedy="give it in s"
+    )  # fmt: skip
+    jitter: float = option(
+        0.0, "Share of this time by which a reading may be later.", at_least=0, remedy="0.1 is 10 % of the interval"
+    )  # fmt: skip
+    delay: float = option(
+        0.0, "Seconds from a reading to the use of its control, at most.", at_least=0, remedy="give it in s"
+    )  # fmt: skip
+    measured: Mapping[str, float] | None = option(
+        None, "The largest error of a state where it is read; may be given again.", metavar="STATE=E",
+        check=check_errors,
+    )  # fmt: skip
+    quantised: Mapping[str, float] | None = option(
+        None, "The step to which a control is rounded; may be given again.", metavar="CONTROL=STEP", check=check_errors
+    )  # fmt: skip

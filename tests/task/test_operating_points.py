@@ -146,7 +146,7 @@ def test_limits_of_states_and_controls_choose():
     assert float(both.goal[0]) == -2
     limited = {"lower": {"z": -1.6}}
     assert float(problem_of(system=Level(), target={"y": 0.1}, initial_states=inside, constraints=limited).goal[0]) == 2
-    with pytest.raises(UsageError, match=r"among those that are admitted, got \[0\.339"):
+    with pytest.raises(UsageError, match=r"at the target within its limits, got duty \(1\) = 0\.339"):
         problem_of(target={"output voltage": 15}, controls={"lower": 0, "upper": 0.2})
 
 

@@ -9,14 +9,12 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import State
-from lyapnet.claims.claim import ReadAtTimes, sides_of
+from lyapnet.claims.claim import sides_of
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.readings import Readings
 from lyapnet.task.noise import StateNoise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.task.varying_limits import VaryingLimits
 
 COMPARED = 1000  # random states of X₀: their mean running cost sets δ, and their costs are compared with optima
 
@@ -34,11 +32,11 @@ def disturbance_of(disturbance: Mapping[str, float] | None, controller: Controll
     Raises:
         UsageError: a name is not the name of a state.
     """
-    w = _of_states("a disturbance", disturbance or {}, controller)
+    w = of_states("a disturbance", disturbance or {}, controller)
     return torch.tensor(w, dtype=torch.float64) if disturbance else None
 
 
-def _of_states(what: str, given: Mapping[str, float], controller: Controller) -> list[float]:
+def of_states(what: str, given: Mapping[str, float], controller: Controller) -> list[float]:
     """A number for each state, 0 for those that are not named.
 
     Raises:
@@ -50,46 +48,6 @@ def _of_states(what: str, given: Mapping[str, float], controller: Controller) ->
             hint = did_you_mean(name, names, "name one of them.")
             raise UsageError(f"Expected {what} of {', '.join(names)}, got '{name}={value:g}'; {hint}")
     return [given.get(name, 0.0) for name in names]
-
-
-def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:
-    """When the law is read, and how far this may be off; None for a claim about u read at every t.
-
-    Args:
-        made_for: "continuous" or "held", if the claim does not say it; continuous where no held law is covered.
-        forever: whether the law is read as u(0, x).
-
-    Raises:
-        UsageError: options of a held law for one that is read at every t, a name is unknown, there are constraints, or
-            limits depend on the state.
-    """
-    problem, system = controller.problem, controller.system
-    given = [name for name in ("interval", "jitter", "delay", "measured", "quantised") if getattr(claim, name)]
-    covered = problem.constraints is None and not isinstance(problem.controls, VaryingLimits)
-    time = claim.time or ("held" if given or (made_for == "held" and covered) else "continuous")
-    if time == "continuous":
-        if given:
-            raise UsageError(f"Expected --time held with --{given[0]}, got continuous; u is then read at every t.")
-        return None
-    if problem.constraints is not None:
-        raise UsageError("Expected no state constraints for a law that is held, got some; add --time continuous.")
-    if isinstance(problem.controls, VaryingLimits):
-        raise UsageError(
-            "Expected limits that do not depend on the state for a law that is held, got some that do; between two "
-            "readings u would follow them. Add --time continuous."
-        )
-    errors = _of_states("the error", claim.measured or {}, controller)
-    constant = [system.state_names[i] for i in system.constants if errors[i]]
-    if constant:
-        raise UsageError(f"Expected errors of measured states, got {constant[0]}, a parameter; leave it out.")
-    steps, interval = claim.quantised or {}, claim.interval or problem.horizon.dt
-    unknown = [name for name in steps if name not in system.control_names]
-    if unknown:
-        hint = did_you_mean(unknown[0], system.control_names, "name one of them.")
-        raise UsageError(f"Expected steps of {', '.join(system.control_names)}, got '{unknown[0]}'; {hint}")
-    rounding = tuple(steps.get(name, 0.0) / 2 for name in system.control_names)
-    duration = None if forever else problem.horizon.duration
-    return Readings(round((1 + claim.jitter) * interval, 12), claim.delay, tuple(errors), rounding, duration)
 
 
 def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tuple[ClosedLoop, Problem]:
@@ -104,7 +62,7 @@ def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tu
     if problem.noise is not None:
         raise UsageError("Expected no noise beside that of the task, got some; leave it out.")
     loop = copied(loop)
-    loop.noise = StateNoise(_of_states("noise", noise, controller), torch.float64)
+    loop.noise = StateNoise(of_states("noise", noise, controller), torch.float64)
     return loop, problem.replaced(noise=loop.noise)
 
 

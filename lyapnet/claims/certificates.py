@@ -13,9 +13,7 @@ from lyapnet.claims import figures
 from lyapnet.claims.report import require_writable, write_outputs
 from lyapnet.claims.tables import rows_of, table_of, text_of
 from lyapnet.controller.controller import Controller
-from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict
-from lyapnet.task.systems import ControlSystem
 
 NOT_PROVED = "No level ρ was proved: nothing is claimed. The conditions below were not proved."
 FROZEN = "everything else that their code reads (globals, counters, files) is frozen at its value then."
@@ -125,56 +123,6 @@ def disturbance_text(w: Mapping[str, float]) -> str:
     """The disturbances of a claim, in words."""
     bounds = ", ".join(f"of at most {bound!r} on d({name})/dt" for name, bound in w.items())
     return f"under all disturbances {bounds}"
-
-
-def readings_facts(readings: Readings | None, system: ControlSystem) -> dict[str, Any]:
-    """When u is read, by the keys of a certificate's result; none where it is read at every t."""
-    if readings is None:
-        return {}
-    return {
-        "read_within": readings.interval, "used_within": readings.delay,
-        "measured": _named(system.state_names, readings.errors),
-        "control_errors": _named(system.control_names, readings.control_errors),
-    }  # fmt: skip
-
-
-READINGS = {
-    "read_within": "seconds between two readings of u, at most",
-    "used_within": "seconds from a reading to its use, at most",
-    "measured": "errors of the states that are read, at most",
-    "control_errors": "errors of the controls, at most",
-}
-"""Labels of `readings_facts`."""
-
-
-def readings_text(readings: Readings | None, system: ControlSystem) -> str:
-    """When u is read, in words."""
-    if readings is None:
-        return "with u read at every t"
-    delay = ""
-    if readings.delay:
-        delay = f", used in this order, at most {readings.delay!r} s later (that of t = 0 at once)"
-    errors = "".join(
-        f", with an error of at most {value!r} of {what}{name}"
-        for what, named in (("the measured ", _named(system.state_names, readings.errors)),
-                            ("", _named(system.control_names, readings.control_errors)))
-        for name, value in named.items()
-    )  # fmt: skip
-    return f"with u read at any times at most {readings.interval!r} s apart{delay}, and held until the next{errors}"
-
-
-def control_of(readings: Readings, law: str) -> str:
-    """The control of a reading as a formula, with the errors that are not 0.
-
-    Args:
-        law: the law with {} in the place of the error.
-    """
-    return law.format(" + e" * any(readings.errors)) + " + r" * any(readings.control_errors)
-
-
-def _named(names: Sequence[str], bounds: Sequence[float]) -> dict[str, float]:
-    """The bounds that are not 0, by name."""
-    return {name: bound for name, bound in zip(names, bounds, strict=True) if bound > 0}
 
 
 def format_state(x: Sequence[float]) -> str:

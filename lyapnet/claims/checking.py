@@ -17,7 +17,7 @@ from lyapnet.base.types import State
 from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.funnel import prove_funnel
-from lyapnet.claims.kept_regions import kept_region, readings_in
+from lyapnet.claims.kept_regions import kept_region
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.noisy_certificate import NoisyCertificate
 from lyapnet.claims.noisy_funnel import prove_noisy_funnel
@@ -34,7 +34,7 @@ from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress
-from lyapnet.prover.readings import Readings
+from lyapnet.prover.readings import Readings, readings_from
 from lyapnet.task.sets import Box
 
 UNLIMITED = 1e9  # seconds: a check ends when all leaves are bounded, so that it needs no budget
@@ -129,7 +129,7 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
     content = part_of(read_proofs(path), name, path)
     with refusing(path):
         of = content["of"][0]
-        readings = readings_in(of, controller.horizon.duration)
+        readings = readings_from(of.get("readings"), controller.horizon.duration)
         last = None if readings is None else -1  # the last axis is the age of a reading
         lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:last] for side in ("lower", "upper"))
         w = None if of["disturbance"] is None else torch.tensor(of["disturbance"], dtype=torch.float64)

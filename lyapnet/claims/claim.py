@@ -223,15 +223,13 @@ READ_AT = ("continuous", "held")
 
 def check_errors(value: Any) -> None:
     """Refuse a value that is not a mapping from names to finite numbers ≥ 0."""
-    usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(e) for n, e in value.items())
-    if not usable or not all(0 <= e < math.inf for e in value.values()):
+    if not _are_sizes(value):
         raise UsageError(f'Expected errors as numbers ≥ 0 by name, got {value!r}; for example {{"velocity": 0.01}}.')
 
 
 def check_noise(value: Any) -> None:
     """Refuse a value that is not a mapping from names to numbers ≥ 0, one of them positive."""
-    usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(s) for n, s in value.items())
-    if not usable or not all(0 <= s < math.inf for s in value.values()) or not any(value.values()):
+    if not _are_sizes(value) or not any(value.values()):
         raise UsageError(f'Expected noise as numbers ≥ 0 by name, got {value!r}; for example {{"velocity": 0.1}}.')
 
 
@@ -250,6 +248,12 @@ def check_parameters(value: Any) -> None:
             f"Expected parameters as finite numbers (lower, upper) by name, with lower ≤ upper, got {value!r}; for "
             'example {"mass": (0.9, 1.1)}.'
         )
+
+
+def _are_sizes(value: Any) -> bool:
+    """Whether a value is a mapping from names to finite numbers ≥ 0."""
+    usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(s) for n, s in value.items())
+    return usable and all(0 <= size < math.inf for size in value.values())
 
 
 def _is_number(value: Any) -> bool:

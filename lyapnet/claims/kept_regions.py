@@ -1,10 +1,10 @@
 """Reads the file of a region's proof: the numbers that are to be proved again."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch import Tensor
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import State
 from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
-from lyapnet.prover.readings import Readings
+from lyapnet.prover.readings import Readings, readings_from
 from lyapnet.task.sets import Box
 
 NEW_FILE = "choose another file"
@@ -90,7 +90,7 @@ def kept_region(path: Path) -> KeptRegion:
     with refusing(path):
         of, wanted, _ = content["of"]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64) for side in ("lower", "upper"))
-        readings = readings_in(of, None)
+        readings = readings_from(of.get("readings"), None)
         if readings is not None:  # the last axis is the age of a reading
             lower, upper = lower[:-1], upper[:-1]
         n = len(lower) - 1 - len(of.get("parameters", []))
@@ -108,28 +108,6 @@ def kept_region(path: Path) -> KeptRegion:
             contracting = Box(lowest, highest), Y
         D = Box(lower[1 : 1 + n], upper[1 : 1 + n])
         return KeptRegion(path, decay, D, ranges, contracting, w, readings, hole, wanted, rho, seconds)
-
-
-def readings_in(of: Mapping[str, Any], duration: float | None) -> Readings | None:
-    """When u is read, as a file says it; None: at every t.
-
-    Args:
-        duration: T; None for the receding law.
-
-    Raises:
-        ValueError: invalid numbers.
-    """
-    facts = of.get("readings")
-    if facts is None:
-        return None
-    found = Readings(
-        float(facts["interval"]), float(facts["delay"]), tuple(map(float, facts["errors"])),
-        tuple(map(float, facts["control_errors"])), duration,
-    )  # fmt: skip
-    numbers = [found.interval, found.delay, *found.errors, *found.control_errors]
-    if not found.interval > 0 or not all(0 <= number < math.inf for number in numbers):
-        raise ValueError("invalid readings")
-    return found
 
 
 def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:

@@ -118,8 +118,9 @@ class Funnel(ReadAtTimes):
         require_known_minimum(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, disturbance_of, readings_of, slack_of
+        from lyapnet.claims.arguments import box_of, disturbance_of, slack_of
         from lyapnet.claims.funnel import prove_funnel
+        from lyapnet.claims.held_laws import readings_of
         from lyapnet.claims.least_cost import DEGREE
         from lyapnet.claims.preconditions import require_goal
         from lyapnet.claims.sound_certificate import SoundCertificate
@@ -262,7 +263,8 @@ class Region(ReadAtTimes):
         require_written_law(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, disturbance_of, readings_of
+        from lyapnet.claims.arguments import box_of, disturbance_of
+        from lyapnet.claims.held_laws import readings_of
         from lyapnet.claims.plants import plants_of
         from lyapnet.claims.region import prove_region
         from lyapnet.claims.region_certificate import RegionCertificate

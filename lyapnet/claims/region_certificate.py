@@ -15,15 +15,12 @@ from lyapnet.claims import figures
 from lyapnet.claims.certificates import (
     FROZEN,
     NOT_PROVED,
-    READINGS,
     Certificate,
-    control_of,
     disturbance_text,
     format_state,
     named_disturbance,
-    readings_facts,
-    readings_text,
 )
+from lyapnet.claims.held_laws import READINGS, control_of, readings_facts, readings_text
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
 from lyapnet.claims.region import ProvedRegion

@@ -12,16 +12,13 @@ from lyapnet.claims.arguments import COMPARED
 from lyapnet.claims.certificates import (
     FROZEN,
     NOT_PROVED,
-    READINGS,
-    control_of,
     disturbance_text,
     format_state,
     named_disturbance,
-    readings_facts,
-    readings_text,
 )
 from lyapnet.claims.costs import CostCertificate, Inside
 from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.held_laws import READINGS, control_of, readings_facts, readings_text
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.tables import floored

@@ -12,6 +12,7 @@ boxes of (t̂, x̂, a). Bounds hold for every sequence of readings: nothing is s
 import copy
 import hashlib
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -80,7 +81,6 @@ class BoundedReadings(Bounds):
             return c, height(t, x), *others
 
         one, step = torch.ones(m, dtype=torch.float64), (upper - lower)[1:] / PIECES
-        self._range = torch.full((m,), -torch.inf).double(), torch.full((m,), torch.inf).double()
         self._law = BoundedFunction(lambda t, x: (loop.policy(t, x),), domain)
         self._rate = BoundedFunction(
             lambda t, y: (rate(y[:n], y[n:]),), (torch.cat([lower, -one]), torch.cat([upper, one]))
@@ -194,17 +194,21 @@ class BoundedReadings(Bounds):
         ((heights, _),) = BoundedFunction(lambda t, x: (height(t, x),), self.domain).bounds(lower, upper)
         if not bool((heights > level).all()):  # else no closed loop is there, and any bounds hold
             lower, upper = lower[~(heights > level)], upper[~(heights > level)]
-        least, most = self._controls(lower, upper)
+        least, most = self._controls_read(lower, upper)
         controls = least.amin(0), most.amax(0)
         low, high = self._rates(lower[:, 1:], upper[:, 1:], *(side.expand(len(lower), -1) for side in controls))
         return controls, torch.maximum(-low, high).amax(0)
 
     def _controls(self, lower: Corners, upper: Corners) -> Sides:
         """Bounds of the controls that are read in boxes of (t, x), where the closed loop can be."""
+        low, high = self._controls_read(lower, upper)
+        return low.maximum(self._range[0]), high.minimum(self._range[1])
+
+    def _controls_read(self, lower: Corners, upper: Corners) -> Sides:
+        """Bounds of the controls that are read in boxes of (t, x)."""
         errors = torch.cat([torch.zeros(1, dtype=torch.float64).to(lower), self._errors])
         ((low, high),) = self._law.bounds(lower - errors, upper + errors)
-        low, high = low - self._control_errors, high + self._control_errors
-        return low.maximum(self._range[0]), high.minimum(self._range[1])
+        return low - self._control_errors, high + self._control_errors
 
     def _rates(self, lower: State, upper: State, least: Control, most: Control) -> Sides:
         """Bounds of ẋ on boxes of states with controls between bounds."""
@@ -231,11 +235,18 @@ def _in_first_axes(form: TaylorForm, count: int) -> TaylorForm:
 
     |ε_j ε_k| ≤ 1, and 0 ≤ ε_k² ≤ 1 for the square of another coordinate.
     """
-    every = monomials(form.dimension, form.degree)
-    kept = [k for k, axes in enumerate(every) if all(axis < count for axis in axes)]
-    squares = [k for k, axes in enumerate(every) if len(axes) == 2 and axes[0] == axes[1] >= count]
-    others = [k for k in range(len(every)) if k not in {*kept, *squares}]
+    kept, squares, others = _terms_by_axes(form.dimension, form.degree, count)
     terms, half = form.terms[kept].clone(), form.terms[squares] / 2
     terms[0] += half.sum(0)
     radius = form.radius + half.abs().sum(0) + form.terms[others].abs().sum(0)
-    return TaylorForm(terms, radius, count).with_rounding(len(every))
+    return TaylorForm(terms, radius, count).with_rounding(len(form.terms))
+
+
+@cache
+def _terms_by_axes(dimension: int, degree: int, count: int) -> tuple[list[int], list[int], list[int]]:
+    """The places of the terms in the first `count` coordinates alone, of squares of another one, and of all others."""
+    every = monomials(dimension, degree)
+    kept = [k for k, axes in enumerate(every) if all(axis < count for axis in axes)]
+    squares = [k for k, axes in enumerate(every) if len(axes) == 2 and axes[0] == axes[1] >= count]
+    others = {*range(len(every))} - {*kept, *squares}
+    return kept, squares, sorted(others)

@@ -164,6 +164,11 @@ class DecreaseCondition(nn.Module):
             return point[None]
         return torch.cat([point, after / self.readings.span(point[:1]).clamp_min(1e-9)])[None]
 
+    def meaning_of(self, point: Corner) -> tuple[float, list[float], float]:
+        """(t, x, the seconds since the reading) of a point of `values`: the inverse of `point_of`."""
+        t, x = point[:1], point[1 : 1 + self.n].tolist()
+        return float(t), x, 0.0 if self.readings is None else float(point[-1:] * self.readings.span(t))
+
     def after_reading(self, readings: Readings, points: Points) -> tuple[PerState, Run]:
         """(c, the state) of the worst of some closed loops at t̂ + a, for points (t̂, x̂, a/span)."""
         run = simulate_runs(self.closed_loop, readings, points[:, 0], points[:, 1:-1], points[:, -1])

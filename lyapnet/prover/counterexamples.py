@@ -59,9 +59,8 @@ def lowest_violation(
     if not len(candidates):
         return None
     first = candidates[0]
-    t, x, *share = points[first].split([1, condition.n, len(points[first]) - 1 - condition.n])
-    after = 0.0 if condition.readings is None else float(share[0] * condition.readings.span(t))
-    return Counterexample(float(t), x.tolist(), float(c[first]), float(W[first]), after)
+    t, x, after = condition.meaning_of(points[first])
+    return Counterexample(t, x, float(c[first]), float(W[first]), after)
 
 
 def violations(

@@ -59,6 +59,27 @@ class Readings:
         return span if self.duration is None else torch.minimum(span, self.duration - t)
 
 
+def readings_from(facts: Any, duration: float | None) -> Readings | None:
+    """Readings from their `facts`, as a file of a proof has them; None for None, a law that is read at every t.
+
+    Args:
+        duration: as in Readings.
+
+    Raises:
+        ValueError: invalid numbers.
+    """
+    if facts is None:
+        return None
+    found = Readings(
+        float(facts["interval"]), float(facts["delay"]), tuple(map(float, facts["errors"])),
+        tuple(map(float, facts["control_errors"])), duration,
+    )  # fmt: skip
+    numbers = [found.interval, found.delay, *found.errors, *found.control_errors]
+    if not found.interval > 0 or not all(0 <= number < math.inf for number in numbers):
+        raise ValueError("invalid readings")
+    return found
+
+
 class Run(NamedTuple):
     """Closed loops at an age after a reading, (runs, *batch, …) each."""
 

@@ -1,14 +1,12 @@
 """The ball ‖u‖ ≤ r as a set of controls, and the minimiser of a quadratic cost and ‖u‖ in it."""
 
-import copy
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply, norm, solve
 from lyapnet.base.types import Control, ControlMatrix, State
-from lyapnet.task.sets import ControlSet
+from lyapnet.task.sets import ControlSet, passed_through
 
 NEWTON_STEPS = 10  # for a multiplier: they converge from one side, and double its digits at each step
 TINY = 1e-100  # replaces 0 in denominators
@@ -51,7 +49,7 @@ class ControlBall(ControlSet):
         return (u.double() ** 2).sum(-1) <= self.radius.double() ** 2
 
     def rounded_for(self, dtype: torch.dtype) -> ControlSet:
-        return copy.deepcopy(self).to(dtype).to(self.radius.dtype)
+        return passed_through(self, dtype)
 
     def applied(self, x: State, u: Control) -> Control:
         return self._inwards(u, self.rounding) if self.rounding > torch.finfo(u.dtype).eps else u

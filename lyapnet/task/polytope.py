@@ -1,6 +1,5 @@
 """A polytope as a set of controls: limits that several controls share."""
 
-import copy
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, ControlMatrix, State
-from lyapnet.task.sets import ControlSet, finite_numbers
+from lyapnet.task.sets import ControlSet, finite_numbers, passed_through
 
 MOST_CONTROLS = 4
 MOST_COMBINATIONS = 2000  # of rows that may hold together: each is a linear system for each state
@@ -88,7 +87,7 @@ class ControlPolytope(ControlSet):
         return self.b.double() - INWARDS * self.rounding * self.sizes.double()
 
     def rounded_for(self, dtype: torch.dtype) -> "ControlPolytope":
-        return copy.deepcopy(self).to(dtype).to(self.A.dtype)
+        return passed_through(self, dtype)
 
     def applied(self, x: State, u: Control) -> Control:
         return self._pulled(u.double()).to(u) if self.rounding > torch.finfo(u.dtype).eps else u

@@ -1,10 +1,11 @@
 """Sets of states and of controls."""
 
+import copy
 import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -190,6 +191,15 @@ class ControlSet(nn.Module, ABC):
     @abstractmethod
     def project(self, u: Control) -> Control:
         """The point of U closest to each control."""
+
+
+AnySet = TypeVar("AnySet", bound=ControlSet)
+
+
+def passed_through(controls: AnySet, dtype: torch.dtype) -> AnySet:
+    """A copy of a set with the rounding of another precision, in the precision of the set."""
+    own = next(each.dtype for each in controls.buffers() if each.is_floating_point())
+    return copy.deepcopy(controls).to(dtype).to(own)
 
 
 def finite_numbers(name: str, given: Any) -> Tensor:

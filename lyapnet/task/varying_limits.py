@@ -13,7 +13,7 @@ from lyapnet.base.contracts import check_function
 from lyapnet.base.errors import ExportError, UsageError
 from lyapnet.base.types import Control, State
 from lyapnet.task.mapped_controls import MappedControls
-from lyapnet.task.sets import ControlBox, finite_numbers
+from lyapnet.task.sets import ControlBox, finite_numbers, passed_through
 from lyapnet.task.systems import ControlSystem
 
 TRIED = 64  # states at which a user's function is tested
@@ -164,7 +164,7 @@ class LimitTable(VaryingLimits):
         return bound
 
     def rounded_for(self, dtype: torch.dtype) -> "LimitTable":
-        return copy.deepcopy(self).to(dtype).to(self.lower.dtype)
+        return passed_through(self, dtype)
 
     def limits_at(self, x: State) -> tuple[Control, Control]:
         assert self.index is not None  # a problem binds it to its system

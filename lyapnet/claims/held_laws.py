@@ -1,0 +1,110 @@
+"""Claims about a law that is read at times and held: its readings from the options, as facts and in words."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.claims.arguments import of_states
+from lyapnet.claims.claim import ReadAtTimes
+from lyapnet.controller.controller import Controller
+from lyapnet.prover.readings import Readings
+from lyapnet.task.problem import Problem
+from lyapnet.task.systems import ControlSystem
+from lyapnet.task.varying_limits import VaryingLimits
+
+
+def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:
+    """When the law is read, and how far this may be off; None for a claim about u read at every t.
+
+    Args:
+        made_for: "continuous" or "held", if the claim does not say it; continuous where no held law is covered.
+        forever: whether the law is read as u(0, x).
+
+    Raises:
+        UsageError: options of a held law for one that is read at every t, a name is unknown, there are constraints, or
+            limits depend on the state.
+    """
+    problem, system = controller.problem, controller.system
+    given = [name for name in ("interval", "jitter", "delay", "measured", "quantised") if getattr(claim, name)]
+    refused = _reason_against(problem)
+    time = claim.time or ("held" if given or (made_for == "held" and refused is None) else "continuous")
+    if time == "continuous":
+        if given:
+            raise UsageError(f"Expected --time held with --{given[0]}, got continuous; u is then read at every t.")
+        return None
+    if refused is not None:
+        raise UsageError(refused)
+    errors = of_states("the error", claim.measured or {}, controller)
+    constant = [system.state_names[i] for i in system.constants if errors[i]]
+    if constant:
+        raise UsageError(f"Expected errors of measured states, got {constant[0]}, a parameter; leave it out.")
+    steps, interval = claim.quantised or {}, claim.interval or problem.horizon.dt
+    unknown = [name for name in steps if name not in system.control_names]
+    if unknown:
+        hint = did_you_mean(unknown[0], system.control_names, "name one of them.")
+        raise UsageError(f"Expected steps of {', '.join(system.control_names)}, got '{unknown[0]}'; {hint}")
+    rounding = tuple(steps.get(name, 0.0) / 2 for name in system.control_names)
+    duration = None if forever else problem.horizon.duration
+    return Readings(round((1 + claim.jitter) * interval, 12), claim.delay, tuple(errors), rounding, duration)
+
+
+def _reason_against(problem: Problem) -> str | None:
+    """The message that refuses claims about held laws of a task; None if they cover it."""
+    if problem.constraints is not None:
+        return "Expected no state constraints for a law that is held, got some; add --time continuous."
+    if isinstance(problem.controls, VaryingLimits):
+        return (
+            "Expected limits that do not depend on the state for a law that is held, got some that do; between two "
+            "readings u would follow them. Add --time continuous."
+        )
+    return None
+
+
+def readings_facts(readings: Readings | None, system: ControlSystem) -> dict[str, Any]:
+    """When u is read, by the keys of a certificate's result; none where it is read at every t."""
+    if readings is None:
+        return {}
+    return {
+        "read_within": readings.interval, "used_within": readings.delay,
+        "measured": _named(system.state_names, readings.errors),
+        "control_errors": _named(system.control_names, readings.control_errors),
+    }  # fmt: skip
+
+
+READINGS = {
+    "read_within": "seconds between two readings of u, at most",
+    "used_within": "seconds from a reading to its use, at most",
+    "measured": "errors of the states that are read, at most",
+    "control_errors": "errors of the controls, at most",
+}
+"""Labels of `readings_facts`."""
+
+
+def readings_text(readings: Readings | None, system: ControlSystem) -> str:
+    """When u is read, in words."""
+    if readings is None:
+        return "with u read at every t"
+    delay = ""
+    if readings.delay:
+        delay = f", used in this order, at most {readings.delay!r} s later (that of t = 0 at once)"
+    errors = "".join(
+        f", with an error of at most {value!r} of {what}{name}"
+        for what, named in (("the measured ", _named(system.state_names, readings.errors)),
+                            ("", _named(system.control_names, readings.control_errors)))
+        for name, value in named.items()
+    )  # fmt: skip
+    return f"with u read at any times at most {readings.interval!r} s apart{delay}, and held until the next{errors}"
+
+
+def control_of(readings: Readings, law: str) -> str:
+    """The control of a reading as a formula, with the errors that are not 0.
+
+    Args:
+        law: the law with {} in the place of the error.
+    """
+    return law.format(" + e" * any(readings.errors)) + " + r" * any(readings.control_errors)
+
+
+def _named(names: Sequence[str], bounds: Sequence[float]) -> dict[str, float]:
+    """The bounds that are not 0, by name."""
+    return {name: bound for name, bound in zip(names, bounds, strict=True) if bound > 0}

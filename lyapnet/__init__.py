@@ -46,10 +46,12 @@ if TYPE_CHECKING:
     )
     from lyapnet.task.ellipsoid import ControlEllipsoid
     from lyapnet.task.horizon import Horizon
+    from lyapnet.task.models.sympy_equations import sympy_system
+    from lyapnet.task.models.systems import casadi_system
     from lyapnet.task.polytope import ControlPolytope
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
-    from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem
+    from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem, EquationSystem
     from lyapnet.task.varying_limits import LimitTable, VaryingLimits
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
@@ -96,7 +98,9 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "task.ball": ["ControlBall"],
     "task.ellipsoid": ["ControlEllipsoid"],
     "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
-    "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem"],
+    "task.models.systems": ["casadi_system"],
+    "task.models.sympy_equations": ["sympy_system"],
+    "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem", "EquationSystem"],
     "task.varying_limits": ["LimitTable", "VaryingLimits"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
@@ -127,6 +131,7 @@ __all__ = [
     "Controller",
     "Cost",
     "EntropyCost",
+    "EquationSystem",
     "Everywhere",
     "Funnel",
     "HJBPolicy",
@@ -172,12 +177,14 @@ __all__ = [
     "ValueProgram",
     "VaryingLimits",
     "__version__",
+    "casadi_system",
     "certify",
     "evaluate",
     "export",
     "load",
     "norm",
     "option",
+    "sympy_system",
     "train",
 ]
 

@@ -16,7 +16,7 @@ from lyapnet.experiment.assembly.classes import float64_defaults, section
 from lyapnet.loop.random_plants import NominalLaw
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.readings import Readings
-from lyapnet.task.family import PREFIX, FamilySystem, check_members, with_constant_states
+from lyapnet.task.family import PREFIX, FamilySystem, check_members, parameter_of, with_constant_states
 from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
@@ -99,7 +99,7 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
     lower, upper = (torch.tensor([ends[i] for ends in ranges.values()], dtype=torch.float64) for i in (0, 1))
     plants = Plants(
         FamilySystem(system, list(ranges), [""] * len(ranges)),
-        {name: getattr(system, name, math.nan) for name in ranges},
+        {name: parameter_of(system, name, math.nan) for name in ranges},
         Box(lower, upper),
     )
     X0 = plants.around(controller.initial_states)

@@ -18,7 +18,7 @@ from lyapnet.experiment.config import Config
 from lyapnet.task.constraints import names_of
 from lyapnet.task.cost import MadeOfAnother, QuadraticCost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem
-from lyapnet.task.systems import SYSTEMS, ControlSystem
+from lyapnet.task.systems import SYSTEMS, ControlSystem, EquationSystem
 
 
 def require_writable(figure: Path | None, folder: Path | None, keep: str | None = None) -> None:
@@ -196,14 +196,21 @@ def _system(controller: Controller, config: Config) -> dict[str, Any]:
     """Name and parameters of the system, without the parameters of a family."""
     system = controller.system
     if not isinstance(system, FamilySystem):
-        return {"name": _name(system), "parameters": controller.parameters}
+        return {"name": _name(system), "parameters": controller.parameters, **_equations(system)}
     parameters = parameters_of(system.system, config.system)
     fixed = {name: value for name, value in parameters.items() if name not in config.family}
-    return {"name": f"family of {_name(system.system)}", "parameters": fixed}
+    return {"name": f"family of {_name(system.system)}", "parameters": fixed, **_equations(system.system)}
+
+
+def _equations(system: ControlSystem) -> dict[str, str]:
+    """The equations of a system that has some."""
+    return {"equations": system.definition.equations} if isinstance(system, EquationSystem) else {}
 
 
 def _name(system: ControlSystem) -> str:
     """The name of a registered system, else module:Class."""
+    if isinstance(system, EquationSystem):
+        return system.title
     cls = type(system)
     return next((name for name, known in SYSTEMS.items() if known is cls), f"{cls.__module__}:{cls.__qualname__}")
 

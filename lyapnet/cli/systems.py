@@ -11,7 +11,7 @@ def systems(debug: Debug = False) -> None:
     import inspect
 
     from lyapnet.experiment.assembly import REGISTRIES
-    from lyapnet.task.systems import SYSTEMS
+    from lyapnet.task.systems import BY_EQUATIONS, SYSTEMS
 
     columns = (Column(name, overflow="fold") for name in ("system", "states", "controls", "parameters (default)"))
     table = Table(*columns, title="system.name in a config")
@@ -28,6 +28,7 @@ def systems(debug: Debug = False) -> None:
         )
     console = Console(highlight=False, markup=False)
     console.print(table)
+    console.print(f"system.name of equations, in the config or from a model's file: {', '.join(BY_EQUATIONS)}")
     for part, (registry, _) in REGISTRIES.items():
         if part != "system":
             console.print(f"{part}.name: {', '.join(registry)}", soft_wrap=True)

@@ -16,7 +16,7 @@ from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import knows, ranges_of, with_parameters
 from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
-from lyapnet.task.family import FamilySystem
+from lyapnet.task.family import FamilySystem, parameter_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
@@ -187,7 +187,7 @@ def nominal(family: Controller) -> dict[str, float]:
         name: math.sqrt(least * greatest) if name in system.weights else (least + greatest) / 2
         for name, (least, greatest) in ranges.items()
     }
-    given = {name: getattr(system.system, name, middle[name]) for name in middle}
+    given = {name: parameter_of(system.system, name, middle[name]) for name in middle}
     return {name: value if knows(ranges[name], value) else middle[name] for name, value in given.items()}
 
 

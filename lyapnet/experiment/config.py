@@ -4,6 +4,7 @@ A YAML file lists only values that differ from these defaults; `key.sub=value` o
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from lyapnet.base.sizes import THREADS, check_sizes
 from lyapnet.experiment.csv_columns import read_columns
 from lyapnet.experiment.recipe import STANDARD, with_recipe
 from lyapnet.experiment.schema import Names, check_values, checked, differences, read_yaml, setting
+from lyapnet.task.models.reading import KINDS
 
 # names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
@@ -28,7 +30,7 @@ GRADIENTS = Names("loop.rollout", "GRADIENTS")
 METHODS = Names("loop.rollout", "METHODS")
 CONTROL_SETS = Names("task.control_sets", "CONTROL_SETS")
 CONTROL_COSTS = Names("task.cost.control_costs", "CONTROL_COSTS")
-SYSTEMS = Names("task.systems", "SYSTEMS")
+SYSTEMS = Names("task.systems", "NAMED_SYSTEMS")
 SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
 
@@ -88,6 +90,13 @@ class SystemConfig:
         user_class=True,
     )
     parameters: dict[str, Any] = setting({}, "Arguments of its constructor, in SI units.")
+    file: str = setting("", "File of a model for casadi, found from the folder of the YAML; it is read into equations.")
+    equations: str = setting(
+        "", "A line der(STATE) = expression for each state, and lines NAME = expression before them.", lines=True
+    )
+    states: dict[str, str] = setting({}, "Name and unit of each state of the equations, in their order.")
+    controls: dict[str, str] = setting({}, "Name and unit of each control, likewise.")
+    angles: list[str] = setting([], "Names of the states of the equations that are angles in rad.")
 
 
 @dataclass
@@ -377,7 +386,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     content = read_yaml(path, Config)
     config = config_from_plain({"experiment": Path(path).stem, **content}, overrides)
     _require_noise_of_each(content, overrides, config.outputs)
-    return _with_reference(config, Path(path).parent)
+    return _with_model(_with_reference(config, Path(path).parent), Path(path).parent)
 
 
 def _require_noise_of_each(content: Mapping[str, Any], overrides: Sequence[str], outputs: OutputsConfig) -> None:
@@ -407,6 +416,34 @@ def _with_reference(config: Config, folder: Path) -> Config:
         raise UsageError("Expected reference.file or reference.points, got both; leave one out.")
     points = read_columns(folder / reference.file)
     return dataclasses.replace(config, reference=dataclasses.replace(reference, file="", points=points))
+
+
+def _with_model(config: Config, folder: Path) -> Config:
+    """The config with the equations of the model that its system is read from."""
+    system = config.system
+    if not system.file:
+        return config
+    if system.equations:
+        raise UsageError("Expected system.file or system.equations, got both; leave one out.")
+    if system.name not in KINDS:
+        raise UsageError(
+            f"Expected system.name as {' or '.join(KINDS)} with system.file, got {system.name}; it reads no file."
+        )
+    from lyapnet.task.models.systems import model_of_file  # here, because it loads torch
+
+    path = folder / system.file
+    read, limits = model_of_file(path, system.name, system.states, system.controls, system.parameters)
+    system = dataclasses.replace(system, file="", **{**read, "angles": system.angles or read["angles"]})
+    controls = config.controls
+    if limits and controls == ControlsConfig():
+        controls = dataclasses.replace(controls, lower=_open(limits[0]), upper=_open(limits[1]))
+    return dataclasses.replace(config, system=system, controls=controls)
+
+
+def _open(limits: Sequence[float]) -> list[float | None] | None:
+    """Limits with None where there is none; None if there are none at all."""
+    given = [limit if math.isfinite(limit) else None for limit in limits]
+    return None if all(limit is None for limit in given) else given
 
 
 def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:

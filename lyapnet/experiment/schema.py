@@ -47,6 +47,7 @@ def setting(
     choices: Sequence[str] = (),
     user_class: bool = False,
     folder: bool = False,
+    lines: bool = False,
     mapping: bool = False,
     above: float | None = None,
     at_least: float | None = None,
@@ -57,10 +58,18 @@ def setting(
     Args:
         user_class: whether module:Class is admissible too.
         folder: whether the value must be a relative path that stays in its folder.
+        lines: whether the text may have several lines.
         mapping: whether a mapping is admissible instead of a list.
     """
     bounds = {">": above, "≥": at_least, "<": below}
-    rule = {"doc": doc, "choices": choices, "user_class": user_class, "folder": folder, "bounds": bounds}
+    rule = {
+        "doc": doc,
+        "choices": choices,
+        "user_class": user_class,
+        "folder": folder,
+        "lines": lines,
+        "bounds": bounds,
+    }
     rule["mapping"] = mapping
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=rule)
@@ -312,5 +321,6 @@ def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
 def _check_text(key: str, value: Any, rule: Mapping[str, Any]) -> None:
     if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
         raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; correct it: {rule['doc']}")
-    if isinstance(value, str) and any(character < " " for character in value):
+    allowed = "\n\t" if rule["lines"] else ""
+    if isinstance(value, str) and any(character < " " and character not in allowed for character in value):
         raise UsageError(f"Expected {key} without control characters, got {value!r}; correct it: {rule['doc']}")

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.loop.rollout import Rollout, Trajectory
-from lyapnet.task.family import FamilySystem
+from lyapnet.task.family import FamilySystem, parameter_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
@@ -96,7 +96,7 @@ class RandomPlants(nn.Module):
         )  # fmt: skip
         self.ranges, system = Box(box.lower[self.n :], box.upper[self.n :]), problem.system
         assert isinstance(system, FamilySystem)
-        known = [float(getattr(system.system, name)) for name in system.parameters_in_f]
+        known = [float(parameter_of(system.system, name)) for name in system.parameters_in_f]
         self.register_buffer("parameters_of_model", self.ranges.lower.new_tensor(known), persistent=False)
 
     def draw(self, x0: State, generator: torch.Generator) -> StateOfPlant:

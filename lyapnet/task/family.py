@@ -282,11 +282,16 @@ def _expand_parameter(x: State, name: str, value: Any) -> PerState:
 
 
 def with_attributes(system: ControlSystem, values: Mapping[str, Any]) -> ControlSystem:
-    """A shallow copy of a system with some attributes replaced."""
+    """A shallow copy of a system with the attributes of some parameters replaced."""
     member = copy.copy(system) if values else system
     for name, value in values.items():
-        setattr(member, name, value)
+        setattr(member, system.attribute_of(name), value)
     return member
+
+
+def parameter_of(system: ControlSystem, name: str, otherwise: Any = None) -> Any:
+    """The value of a system's parameter, if an attribute holds it."""
+    return getattr(system, system.attribute_of(name), otherwise)
 
 
 def check_members(
@@ -305,7 +310,7 @@ def check_members(
         UsageError: f and g do not use a parameter, use values derived from it, or do not accept it as a tensor.
     """
     names, cls = list(family.parameters_in_f), type(family.system).__name__
-    if unused := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
+    if unused := [name for name in names if not isinstance(parameter_of(family.system, name), int | float)]:
         known = [name for name, value in vars(family.system).items() if type(value) in (int, float)]
         raise UsageError(
             f"Expected {called} among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "

@@ -14,22 +14,28 @@ from lyapnet.loop.programs import PROGRAMS
 from lyapnet.task.constraints import CONSTRAINTS
 from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import COSTS
-from lyapnet.task.systems import SYSTEMS
+from lyapnet.task.systems import BY_EQUATIONS, SYSTEMS
 from lyapnet.value.networks import NETWORKS
 
 
 def test_systems_command_lists_every_registered_system(capsys, monkeypatch, build_system):
     monkeypatch.setenv("COLUMNS", "1000")
     assert main(["systems"]) == 0
-    *rows, cost, controls, constraints, network, program, _ = capsys.readouterr().out.splitlines()
+    *rows, equations, cost, controls, constraints, network, program, _ = capsys.readouterr().out.splitlines()
     for name in SYSTEMS:
         (row,) = [row for row in rows if re.search(rf"\b{name}\b", row)]
         system = build_system(name)
         if name != "linear":
             for word in (*system.state_names, *system.state_units, *system.control_names, *system.control_units):
                 assert word in row
-    listed = ((cost, COSTS), (controls, CONTROL_SETS), (constraints, CONSTRAINTS), (network, NETWORKS))
-    for line, known in (*listed, (program, PROGRAMS)):
+    listed = (
+        (equations, BY_EQUATIONS),
+        (cost, COSTS),
+        (controls, CONTROL_SETS),
+        (constraints, CONSTRAINTS),
+        (network, NETWORKS),
+    )
+    for line, known in ((equations, BY_EQUATIONS), *listed, (program, PROGRAMS)):
         assert line.split(": ")[1].split(", ") == list(known)
 
 

@@ -13,13 +13,15 @@ import torch
 
 from lyapnet.base.contracts import initialised, remedy
 from lyapnet.base.errors import LyapnetError, UsageError, did_you_mean, raised
-from lyapnet.experiment.config import Config
+from lyapnet.experiment.config import Config, SystemConfig
 from lyapnet.loop.programs import PROGRAMS, Program
 from lyapnet.task.constraints import CONSTRAINTS, Constraints
 from lyapnet.task.control_sets import CONTROL_SETS
 from lyapnet.task.cost import COSTS, Cost
+from lyapnet.task.models.reading import KINDS
 from lyapnet.task.sets import ControlSet
-from lyapnet.task.systems import SYSTEMS, ControlSystem
+from lyapnet.task.systems import NAMED_SYSTEMS, ControlSystem, EquationSystem
+from lyapnet.task.systems.equations import defined
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import NETWORKS
 
@@ -40,7 +42,7 @@ class Parts:
 
 # section of a config ↦ (registered classes, base class of users' classes)
 REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
-    "system": (SYSTEMS, ControlSystem),
+    "system": (NAMED_SYSTEMS, ControlSystem),
     "cost": (COSTS, Cost),
     "controls": (CONTROL_SETS, ControlSet),
     "constraints": (CONSTRAINTS, Constraints),
@@ -85,15 +87,28 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     return cls
 
 
-def class_of(config: Config, part: str) -> Any:
-    """The class that a section of a config names."""
+def class_of(options: Any, part: str) -> Any:
+    """The class that a section of a config names; of equations, the class that has these."""
     registry, base = REGISTRIES[part]
-    return resolve(getattr(config, part).name, registry, f"{part}.name", base)
+    cls = resolve(options.name, registry, f"{part}.name", base)
+    return class_of_equations(options) if cls is EquationSystem else cls
+
+
+def class_of_equations(options: SystemConfig) -> type[EquationSystem]:
+    """The class of the systems with the equations of a config.
+
+    Raises:
+        UsageError: there are none.
+    """
+    if not options.equations:
+        advice = "name the model's file in system.file" if options.name in KINDS else "write der(STATE) = … for each"
+        raise UsageError(f"Expected system.equations with system.name={options.name}, got none; {advice}.")
+    return defined(options.equations, options.states, options.controls, list(options.parameters), options.angles)
 
 
 def instance_of(options: Any, part: str) -> Any:
     """An object of the class that a section names, from its parameters."""
-    cls = resolve(options.name, REGISTRIES[part][0], f"{part}.name", REGISTRIES[part][1])
+    cls = class_of(options, part)
     check_parameters(cls, options.name, options.parameters, part)
     with float64_defaults(), section(f"{part}.parameters of {options.name}"):
         return initialised(cls(**options.parameters))

@@ -41,7 +41,7 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         UsageError: the network does not have an option, or refuses its value.
     """
     options, n = config.network, problem.system.n
-    cls, kept = network or class_of(config, "network"), _kept_states(config, problem.system)
+    cls, kept = network or class_of(config.network, "network"), _kept_states(config, problem.system)
     name = options.name
     if problem.horizon.stationary and cls is ExpansionNetwork:  # the default network
         cls, name = StationaryNetwork, "stationary"
@@ -155,7 +155,7 @@ def build_program(config: Config) -> Program:
     Raises:
         UsageError: the program does not have an option, or values contradict each other.
     """
-    options, cls = program_options(config), class_of(config, "program")
+    options, cls = program_options(config), class_of(config.program, "program")
     for name in options.keys() - inspect.signature(cls).parameters.keys():
         raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
     check_parameters(cls, config.program.name, config.program.parameters, "program")

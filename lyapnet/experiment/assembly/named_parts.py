@@ -30,7 +30,7 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
         "cost": lambda: build_cost(config.cost),
         "controls": lambda: instance_of(config.controls, "controls"),
         "constraints": lambda: instance_of(config.constraints, "constraints"),
-        "network": lambda: class_of(config, "network"),
+        "network": lambda: class_of(config.network, "network"),
         "program": lambda: build_program(config),
     }
     return Parts(**{part: builders[part]() for part in names})

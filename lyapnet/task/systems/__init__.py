@@ -9,6 +9,7 @@ from lyapnet.task.systems.base import (
     moving_states,
 )
 from lyapnet.task.systems.cartpole import Cartpole
+from lyapnet.task.systems.equations import EquationSystem
 from lyapnet.task.systems.glider import Glider
 from lyapnet.task.systems.kinematic_bicycle import KinematicBicycle
 from lyapnet.task.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
@@ -40,8 +41,12 @@ SYSTEMS: dict[str, type[ControlSystem]] = {
     "kinematic_bicycle": KinematicBicycle,
     "glider": Glider,
 }
+BY_EQUATIONS = ("equations", "casadi", "urdf", "mjcf")  # equations in a config, or read from a model's file
+NAMED_SYSTEMS: dict[str, type[ControlSystem]] = {**SYSTEMS, **dict.fromkeys(BY_EQUATIONS, EquationSystem)}
 
 __all__ = [
+    "BY_EQUATIONS",
+    "NAMED_SYSTEMS",
     "SYSTEMS",
     "Acrobot",
     "BodyFrameQuadrotor",
@@ -49,6 +54,7 @@ __all__ = [
     "ControlAffineSystem",
     "ControlSystem",
     "DoubleIntegrator",
+    "EquationSystem",
     "Glider",
     "IntegratorChain",
     "KinematicBicycle",

@@ -108,6 +108,10 @@ class ControlSystem(nn.Module, ABC):
                 best, least = (u, left) if bool(left < least) else (best, least)
             return best, self.dynamics(x, best)
 
+    def attribute_of(self, parameter: str) -> str:
+        """The attribute that holds a parameter of the constructor: by default the one of its name."""
+        return parameter
+
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
         """The shapes of the system in a state (n,) under a control (m,), in a plane in metres; by default none.
 

@@ -1,0 +1,1 @@
+"""Models that other programs made, read as equations: CasADi functions, robot descriptions, SymPy expressions."""

@@ -1,0 +1,229 @@
+"""CasADi functions (x, u, p…) ↦ ẋ as equations, operation by operation.
+
+It imports neither torch nor other modules of lyapnet that do, because a process without access to files runs it; see
+lyapnet.task.models.reading.
+"""
+
+import keyword
+import math
+import random
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from lyapnet.base.errors import UsageError, one_line
+
+POINTS = 8  # random points at which equations are compared with the function
+
+# CasADi's operation ↦ its expression; booleans are 1 and 0 in both
+EXPRESSIONS = {
+    "ASSIGN": "{0}", "ADD": "{0} + {1}", "SUB": "{0} - {1}", "MUL": "{0} * {1}", "DIV": "{0} / {1}", "NEG": "-{0}",
+    "SQ": "{0} ** 2", "TWICE": "2 * {0}", "INV": "1 / {0}", "POW": "{0} ** {1}", "CONSTPOW": "{0} ** {1}",
+    "LT": "{0} < {1}", "LE": "{0} <= {1}", "EQ": "{0} == {1}", "NE": "{0} != {1}", "NOT": "not {0}",
+    "AND": "{0} and {1}", "OR": "{0} or {1}", "IF_ELSE_ZERO": "where({0}, {1}, 0)", "FABS": "abs({0})",
+    "FMIN": "min({0}, {1})", "FMAX": "max({0}, {1})", "LIFT": "{0}",
+    "REMAINDER": "{0} - {1} * round({0} / {1})",
+    **{
+        name.upper(): f"{name}({{0}})"
+        for name in (
+            "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp",
+            "expm1", "log", "log1p", "sqrt", "sign", "floor", "ceil", "erf",
+        )
+    },
+    **{name.upper(): f"{name}({{0}}, {{1}})" for name in ("atan2", "hypot", "fmod", "copysign")},
+}  # fmt: skip
+RESULTS = ("xdot", "ode", "rhs", "f", "f_expl", "dx")  # names of the derivative, if there are several results
+
+
+class Model(NamedTuple):
+    """The equations of a model, the names in them, and values to compare them with.
+
+    Args:
+        equations: lines as of lyapnet.task.systems.formulas.
+        states, controls, parameters: names, in their order.
+        points: for each compared point the values of states, controls and parameters, and then of ẋ.
+        units: of states and controls; none: not known.
+        angles: names of the states that are angles in rad.
+        limits: least and greatest controls; None: not known.
+    """
+
+    equations: str
+    states: list[str]
+    controls: list[str]
+    parameters: list[str]
+    points: list[list[float]]
+    units: Sequence[str] = ()
+    angles: Sequence[str] = ()
+    limits: list[list[float]] | None = None
+
+
+def model_of_function(function: Any, states: Sequence[str] = (), controls: Sequence[str] = ()) -> Model:
+    """The equations of a CasADi function (x, u, p…) ↦ ẋ.
+
+    x and u are the inputs with these names, or else the first two; all others are parameters.
+
+    Args:
+        states, controls: names in the place of those of the function's symbols.
+
+    Raises:
+        UsageError: an operation has no expression, or the function has other inputs or results.
+    """
+    import casadi
+
+    try:
+        expanded = function if function.is_a("SXFunction") else function.expand()
+    except RuntimeError as error:
+        raise UsageError(
+            f"Expected a CasADi function of elementary operations, got {function.name()}, which CasADi cannot expand "
+            f"({one_line(error)[-150:]}); leave out solvers, interpolants and external functions."
+        ) from error
+    inputs, result = _inputs_of(expanded), _result_of(expanded)
+    given = {inputs[0]: states, inputs[1]: controls}
+    names = {i: _names_of(expanded, i, given.get(i, ())) for i in inputs}
+    n = len(names[inputs[0]])
+    if expanded.size_out(result) != (n, 1):
+        raise UsageError(
+            f"Expected ẋ of shape ({n}, 1) from {function.name()}, as x has {n} entries, got "
+            f"{expanded.size_out(result)}; return a column of derivatives."
+        )
+    taken = [name for each in names.values() for name in each]
+    if twice := [name for k, name in enumerate(taken) if name in taken[:k]]:
+        raise UsageError(f"Expected different names of x, u and p, got {twice[0]} twice; name states and controls.")
+    lines = list(_lines(casadi, expanded, names, result, _prefix(taken)))
+    x, u, *p = (names[i] for i in inputs)
+    return Model("\n".join(lines), x, u, [name for each in p for name in each], list(_values(function, inputs, result)))
+
+
+def function_of_text(casadi: Any, text: str) -> Any:
+    """The function in the text of Function.save or Function.serialize.
+
+    It may run code that the text names: call it where nothing can be opened, or on a text that you wrote.
+    """
+    try:
+        found = casadi.StringDeserializer(text).unpack()  # of save
+    except RuntimeError:
+        found = casadi.Function.deserialize(text)  # of serialize
+        if found.is_null():
+            raise
+    if not isinstance(found, casadi.Function):
+        raise UsageError(
+            f"Expected a CasADi Function, got a saved {type(found).__name__}; save the function (x, u, p) ↦ ẋ."
+        )
+    return found
+
+
+def _inputs_of(function: Any) -> list[int]:
+    """The indices of x, u and the parameters."""
+    names = [name.lower() for name in function.name_in()]
+    used = [i for i in range(function.n_in()) if function.numel_in(i)]
+    first = [names.index("x"), names.index("u")] if {"x", "u"} <= {*names} else used[:2]
+    if len(first) < 2 or not all(i in used for i in first):
+        raise UsageError(
+            "Expected a CasADi function (x, u, p…) with states and controls, got inputs "
+            f"{', '.join(function.name_in())}; call them x and u, or put them first."
+        )
+    others = [i for i in used if i not in first]
+    for i in [*first, *others]:
+        if function.size2_in(i) != 1 or not function.sparsity_in(i).is_dense():
+            raise UsageError(
+                f"Expected inputs that are dense columns, got {function.name_in(i)} of shape {function.size_in(i)}; "
+                "pass columns."
+            )
+    time = [i for i in others if names[i] in ("t", "time") and function.numel_in(i) == 1]
+    depends = [i for i in time if any(function.jac_sparsity(k, i).nnz() for k in range(function.n_out()))]
+    if depends:
+        raise UsageError("Expected dynamics that do not depend on time, got an input t that counts; make it a state.")
+    return [*first, *(i for i in others if i not in time)]
+
+
+def _result_of(function: Any) -> int:
+    """The index of ẋ among the results."""
+    names = [name.lower() for name in function.name_out()]
+    found = [names.index(name) for name in RESULTS if name in names]
+    if function.n_out() > 1 and not found:
+        raise UsageError(
+            f"Expected one result, or one called {', '.join(RESULTS)}, from {function.name()}, got "
+            f"{', '.join(function.name_out())}; return the derivative alone."
+        )
+    return found[0] if found else 0
+
+
+def _names_of(function: Any, i: int, given: Sequence[str]) -> list[str]:
+    """The names of the entries of an input."""
+    count, name = function.numel_in(i), function.name_in(i)
+    if given:
+        if len(given) != count:
+            raise UsageError(
+                f"Expected {count} names for {name} of {function.name()}, got {len(given)} ({', '.join(given)}); name "
+                "each in its order."
+            )
+        return [each.replace(" ", "_") for each in given]
+    symbols = [str(each) for each in function.sx_in(i).elements()]
+    usable = all(_is_name(each) for each in symbols) and len(set(symbols)) == count
+    if usable and not all(each.startswith(f"i{i}") for each in symbols):  # the names that expand() gives
+        return symbols
+    return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
+
+
+def _is_name(text: str) -> bool:
+    return text.isidentifier() and not keyword.iskeyword(text)
+
+
+def _prefix(taken: Sequence[str]) -> str:
+    """What names of intermediate results begin with."""
+    prefix = "v"
+    while any(name.startswith(prefix) and name[len(prefix) :].isdigit() for name in taken):
+        prefix += "_"
+    return prefix
+
+
+def _lines(casadi: Any, function: Any, names: dict[int, list[str]], result: int, prefix: str) -> Iterator[str]:
+    """The assignments of a function's operations, in their order."""
+    known = {getattr(casadi, f"OP_{name}"): form for name, form in EXPRESSIONS.items()}
+    states = next(iter(names.values()))
+    held: dict[int, str] = {}  # the work vector's entries
+    count = 0
+    derivatives = dict.fromkeys(states, "0")
+    rows = function.sparsity_out(result).row()
+    for k in range(function.n_instructions()):
+        operation, given, places = (
+            function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        )  # fmt: skip
+        if operation == casadi.OP_OUTPUT:
+            if places[0] == result:
+                derivatives[states[rows[places[1]]]] = held[given[0]]
+            continue
+        if operation == casadi.OP_INPUT:
+            held[places[0]] = names[given[0]][given[1]] if given[0] in names else "0"  # time, which does not count
+            continue
+        if operation == casadi.OP_CONST:
+            held[places[0]] = _number(function.instruction_constant(k))
+            continue
+        if operation not in known:
+            name = next((n for n in dir(casadi) if n.startswith("OP_") and getattr(casadi, n) == operation), operation)
+            what = "OP_CALL of a solver, table or external function" if operation == casadi.OP_CALL else name
+            raise UsageError(
+                f"Expected operations with an expression in {function.name()}, got CasADi's {what}; write it in others."
+            )
+        yield f"{prefix}{count} = {known[operation].format(*(held[i] for i in given))}"
+        held[places[0]] = f"{prefix}{count}"
+        count += 1
+    for state, value in derivatives.items():
+        yield f"der({state}) = {value}"
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        raise UsageError(f"Expected finite numbers in the CasADi function, got {value}; leave it out.")
+    return repr(value) if value >= 0 else f"({value!r})"
+
+
+def _values(function: Any, inputs: Sequence[int], result: int) -> Iterator[list[float]]:
+    """Values of x, u, p and ẋ at random points, by CasADi's own evaluation."""
+    draw = random.Random(0)
+    for _ in range(POINTS):
+        given = [[0.0] * function.numel_in(i) for i in range(function.n_in())]
+        for i in inputs:
+            given[i] = [draw.uniform(0.5, 1.5) if i in inputs[2:] else draw.gauss(0, 1) for _ in given[i]]
+        value = function.call(given)[result]
+        flat = [float(value[k]) for k in range(value.numel())]
+        yield [*(number for i in inputs for number in given[i]), *flat]

@@ -1,0 +1,155 @@
+"""Systems whose dynamics are equations in a text, which a config has, or which a model of another program became."""
+
+import functools
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.types import Control, InputMatrix, State
+from lyapnet.task.systems.base import ControlSystem
+from lyapnet.task.systems.formulas import Formulas, Number
+
+
+class Definition(NamedTuple):
+    """Equations with the names in them.
+
+    Args:
+        equations: a line `der(state) = expression` for each state, and lines `name = expression` before them.
+        states, controls: (name, unit) of each, in their order. A name with spaces has _ for them in the equations.
+        parameters: their names.
+        angles: names of the states that are angles in rad.
+        title: what the system is called in tables.
+    """
+
+    equations: str
+    states: tuple[tuple[str, str], ...]
+    controls: tuple[tuple[str, str], ...]
+    parameters: tuple[str, ...] = ()
+    angles: tuple[str, ...] = ()
+    title: str = "Equations"
+
+    @property
+    def names(self) -> list[str]:
+        """The names of states, controls and parameters, as equations write them."""
+        return [written(name) for name in (*dict(self.states), *dict(self.controls), *self.parameters)]
+
+
+class EquationSystem(ControlSystem):
+    """ẋ = F(x, u; p) by equations; `system_class` makes the class of a definition, whose arguments are p.
+
+    It is control-affine if the operations show it: ẋ = c + Σ b_j u_j with c and b_j free of u. f and g are then c and
+    b, read off the same equations. A parameter is an attribute, and so may vary in a family, or untold.
+
+    Args:
+        parameters: p by name, in SI units.
+
+    Raises:
+        UsageError: the equations cannot be read, a name in them is not known, or a state has none.
+    """
+
+    definition: Definition
+
+    def __init__(self, **parameters: float):
+        super().__init__()
+        definition = self.definition
+        for kind, entries in (("states", definition.states), ("controls", definition.controls)):
+            if not entries:
+                raise UsageError(f"Expected system.{kind} as {{name: unit}} for the equations, got none; name them.")
+        self.state_names, self.state_units = map(list, zip(*definition.states, strict=True))
+        self.control_names, self.control_units = map(list, zip(*definition.controls, strict=True))
+        self.angles = [_index_of(name, self.state_names) for name in definition.angles]
+        self.formulas = Formulas(
+            definition.equations, definition.names, [f"der({written(name)})" for name in self.state_names]
+        )
+        for name in definition.parameters:
+            if isinstance(parameters[name], bool) or not isinstance(parameters[name], int | float):
+                raise UsageError(f"Expected a number for system.parameters.{name}, got {parameters[name]!r}; give one.")
+            setattr(self, self.attribute_of(name), parameters[name])
+        self.is_affine = True
+        self.is_affine = self._split(torch.zeros(self.n)) is not None
+
+    @property
+    def affine(self) -> bool:
+        return self.is_affine
+
+    @property
+    def title(self) -> str:
+        return self.definition.title
+
+    def attribute_of(self, parameter: str) -> str:
+        return f"value_of_{parameter}" if hasattr(ControlSystem, parameter) else parameter
+
+    def dynamics(self, x: State, u: Control) -> State:
+        x, u = _same_batch(x, u)
+        return torch.stack(self.formulas(self._values(x, u), x[..., 0]), -1)
+
+    def f(self, x: State) -> State:
+        parts = self._split(x)
+        return super().f(x) if parts is None else torch.stack(parts[0], -1)
+
+    def g(self, x: State) -> InputMatrix:
+        parts = self._split(x)
+        return super().g(x) if parts is None else torch.stack([torch.stack(row, -1) for row in parts[1]], -2)
+
+    def _split(self, x: State) -> tuple[list[Tensor], list[list[Tensor]]] | None:
+        """The entries of f and g; None if the operations of the equations are not affine in u."""
+        if not self.is_affine:
+            return None
+        controls = [written(name) for name in self.control_names]
+        return self.formulas.affine(self._values(x, x.new_zeros(*x.shape[:-1], self.m)), controls, x[..., 0])
+
+    def _values(self, x: State, u: Control) -> dict[str, Number]:
+        """The numbers that the equations name."""
+        parameters = (getattr(self, self.attribute_of(name)) for name in self.definition.parameters)
+        return dict(zip(self.definition.names, (*x.unbind(-1), *u.unbind(-1), *parameters), strict=True))
+
+    def __reduce__(self) -> Any:
+        """For copies in other processes, which find the class by its definition."""
+        return _without_init, (self.definition,), self.__dict__
+
+
+@functools.cache
+def system_class(definition: Definition) -> type[EquationSystem]:
+    """The class of the systems with these equations; its constructor takes their parameters by name."""
+    cls = type("EquationSystem", (EquationSystem,), {"definition": definition, "__doc__": EquationSystem.__doc__})
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    cls.__signature__ = inspect.Signature(  # pyright: ignore[reportAttributeAccessIssue]
+        [inspect.Parameter(name, keyword, annotation=float) for name in definition.parameters]
+    )
+    return cls
+
+
+def defined(
+    equations: str, states: Mapping[str, str], controls: Mapping[str, str], parameters: Sequence[str] = (),
+    angles: Sequence[str] = (), title: str = "Equations",
+) -> type[EquationSystem]:  # fmt: skip
+    """The class of the systems with these equations, from names and units in mappings."""
+    named = [tuple((name, unit or "") for name, unit in entries.items()) for entries in (states, controls)]
+    return system_class(Definition(equations, named[0], named[1], tuple(parameters), tuple(angles), title))
+
+
+def written(name: str) -> str:
+    """A name as equations write it, with _ for its spaces."""
+    return name.replace(" ", "_")
+
+
+def _without_init(definition: Definition) -> EquationSystem:
+    cls = system_class(definition)
+    return cls.__new__(cls)
+
+
+def _index_of(name: str, states: Sequence[str]) -> int:
+    if name not in states:
+        hint = did_you_mean(name, states, f"the states are {', '.join(states)}.")
+        raise UsageError(f"Expected system.angles among the states, got {name!r}; {hint}")
+    return list(states).index(name)
+
+
+def _same_batch(x: State, u: Control) -> tuple[State, Control]:
+    """x and u with the same leading axes."""
+    batch = torch.broadcast_shapes(x.shape[:-1], u.shape[:-1])
+    return x.expand(*batch, x.shape[-1]), u.expand(*batch, u.shape[-1])

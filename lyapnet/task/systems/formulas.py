@@ -1,0 +1,379 @@
+"""Formulas as text, such as `der(rate) = -9.81/length*sin(angle)`, read as torch operations without running them.
+
+A text has one assignment in each line: `name = expression` for an intermediate result, `der(state) = expression` for
+the derivative of a state. Expressions have numbers, names, + - * / **, comparisons, and, or, not, and the functions
+in FUNCTIONS; `where(condition, a, b)` is a where the condition holds and b elsewhere. `#` begins a comment.
+"""
+
+import ast
+import functools
+import math
+import operator
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.files import LARGEST_TEXT
+
+Number = float | Tensor
+
+MOST_OPERATIONS = 100_000
+
+
+class Operation(NamedTuple):
+    """An operation on numbers.
+
+    Args:
+        of_tensors: its function in torch.
+        of_numbers: its function in NumPy, for operands that are known before any state is.
+        operands: how many it takes.
+    """
+
+    of_tensors: Callable[..., Any]
+    of_numbers: Callable[..., Any]
+    operands: int = 1
+
+
+def _copysign(a: Tensor, b: Tensor) -> Tensor:
+    return torch.where(b < 0, -a.abs(), a.abs())
+
+
+FUNCTIONS: dict[str, Operation] = {
+    **{
+        name: Operation(getattr(torch, name), getattr(np, name))
+        for name in (
+            "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "expm1", "log", "log1p", "sqrt", "abs", "sign",
+            "floor", "ceil", "round",
+        )
+    },
+    **{
+        name: Operation(getattr(torch, name), getattr(np, name.replace("a", "arc", 1)))
+        for name in ("asin", "acos", "atan", "asinh", "acosh", "atanh")
+    },
+    "erf": Operation(torch.erf, math.erf),
+    "atan2": Operation(torch.atan2, np.arctan2, 2),
+    "hypot": Operation(torch.hypot, np.hypot, 2),
+    "min": Operation(torch.minimum, np.minimum, 2),
+    "max": Operation(torch.maximum, np.maximum, 2),
+    "fmod": Operation(torch.fmod, np.fmod, 2),
+    "copysign": Operation(_copysign, np.copysign, 2),
+    "where": Operation(torch.where, np.where, 3),
+}  # fmt: skip
+CONSTANTS = {"pi": math.pi}
+
+_SIGNS: dict[type, str] = {
+    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**", ast.USub: "negative",
+    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
+    ast.And: "and", ast.Or: "or", ast.Not: "not",
+}  # fmt: skip
+_COMPARISONS: dict[str, Operation] = {
+    sign: Operation(function, function, 2)
+    for sign, function in (
+        ("<", operator.lt), ("<=", operator.le), (">", operator.gt), (">=", operator.ge), ("==", operator.eq),
+        ("!=", operator.ne),
+    )
+}  # fmt: skip
+_LOGICAL: dict[str, Operation] = {
+    "and": Operation(torch.logical_and, np.logical_and, 2),
+    "or": Operation(torch.logical_or, np.logical_or, 2),
+    "not": Operation(torch.logical_not, np.logical_not, 1),
+}
+_OPERATIONS: dict[str, Operation] = {
+    **FUNCTIONS,
+    **_COMPARISONS,
+    **_LOGICAL,
+    "+": Operation(operator.add, np.add, 2),
+    "-": Operation(operator.sub, np.subtract, 2),
+    "*": Operation(operator.mul, np.multiply, 2),
+    "/": Operation(operator.truediv, np.divide, 2),
+    "**": Operation(operator.pow, np.power, 2),
+    "negative": Operation(operator.neg, np.negative),
+}
+
+
+class Instruction(NamedTuple):
+    """An operation on earlier results; operands are their places."""
+
+    operation: str
+    operands: tuple[int, ...]
+
+
+class Affine(NamedTuple):
+    """A number c + Σ b_j u_j that is affine in the controls: c, and b_j by control."""
+
+    rest: Number
+    slopes: dict[int, Number]
+
+
+class Formulas:
+    """Functions of named numbers, as a flat list of operations in which each expression stands once.
+
+    Args:
+        text: the lines of assignments.
+        names: the numbers that are given: states, controls and parameters.
+        results: names that the text has to define, `der(name)` included, in the order of the results.
+        where: what the text is called in messages.
+
+    Raises:
+        UsageError: a line is no such assignment, or a name is unknown, or missing, or assigned twice.
+    """
+
+    def __init__(self, text: str, names: Sequence[str], results: Sequence[str], where: str = "equations"):
+        self.where, self.names = where, tuple(names)
+        self.constants: dict[int, float] = {}
+        self.instructions: dict[int, Instruction] = {}
+        self._known: dict[Any, int] = {}
+        _require_names(names, where)
+        self._places = {name: place for place, name in enumerate(names)}
+        self._size = len(self._places)
+        self._read(text, results)
+        self.results = [self._places[name] for name in results]
+        del self._known, self._places
+
+    def __call__(self, values: Mapping[str, Number], like: Tensor, only: Collection[int] | None = None) -> list[Tensor]:
+        """The results as tensors (*batch,), at given numbers.
+
+        Args:
+            values: each name's number or tensor (*batch,).
+            like: a tensor of the shape, type and device of the results.
+            only: which results, by their index; None: all.
+        """
+        chosen = [place for k, place in enumerate(self.results) if only is None or k in only]
+        found: dict[int, Number] = {**self.constants, **{k: values[name] for k, name in enumerate(self.names)}}
+        for place in self._needed(chosen):
+            operation, operands = self.instructions[place]
+            found[place] = _computed(operation, [found[k] for k in operands], like)
+        return [_filled(found[place], like) for place in chosen]
+
+    def affine(
+        self, values: Mapping[str, Number], controls: Sequence[str], like: Tensor
+    ) -> tuple[list[Tensor], list[list[Tensor]]] | None:
+        """The results as c + Σ_j b_j u_j: (c, [b_1, …, b_m] of each result); None if one is not affine in u.
+
+        Whether they are is decided by the operations alone, the same for all values.
+        """
+        given = {k: values[name] for k, name in enumerate(self.names) if name not in controls}
+        found = {k: Affine(value, {}) for k, value in {**self.constants, **given}.items()}
+        for k, name in enumerate(self.names):
+            if name in controls:
+                found[k] = Affine(0.0, {list(controls).index(name): 1.0})
+        for place in self._needed(self.results):
+            operation, operands = self.instructions[place]
+            result = _affine_result(operation, [found[k] for k in operands], like)
+            if result is None:
+                return None
+            found[place] = result
+        results = [found[place] for place in self.results]
+        columns = range(len(controls))
+        return (
+            [_filled(each.rest, like) for each in results],
+            [[_filled(each.slopes.get(j, 0.0), like) for j in columns] for each in results],
+        )
+
+    def _needed(self, results: Sequence[int]) -> list[int]:
+        """The places of the instructions on which results depend, in the order of the text."""
+        needed, waiting = set[int](), list(results)
+        while waiting:
+            place = waiting.pop()
+            if place in self.instructions and place not in needed:
+                needed.add(place)
+                waiting += self.instructions[place].operands
+        return sorted(needed)
+
+    def _read(self, text: str, results: Sequence[str]) -> None:
+        if len(text) > LARGEST_TEXT:
+            raise UsageError(f"Expected {self.where} below {LARGEST_TEXT} letters, got {len(text)}; simplify them.")
+        for number, written in enumerate(text.splitlines(), 1):
+            line = written.partition("#")[0].strip()
+            place = f"line {number} of {self.where}"
+            try:
+                if line:
+                    self._read_line(line, place, results)
+            except (RecursionError, MemoryError, OverflowError) as error:
+                raise UsageError(
+                    f"Expected shorter expressions and numbers in {place}, got {len(line)} letters; divide it into "
+                    "lines."
+                ) from error
+        if missing := [name for name in results if name not in self._places]:
+            raise UsageError(
+                f"Expected {self.where} with {missing[0]} = …, got none; write one for each of {', '.join(results)}."
+            )
+
+    def _read_line(self, line: str, place: str, results: Sequence[str]) -> None:
+        name, expression = _assignment(line, place)
+        if name.startswith("der(") and name not in results:
+            states = [each[4:-1] for each in results]
+            hint = did_you_mean(name[4:-1], states, f"the states are {', '.join(states)}.")
+            raise UsageError(f"Expected derivatives of states in {place}, got {name}; {hint}")
+        if name in self._places or name in FUNCTIONS or name in CONSTANTS:
+            raise UsageError(f"Expected a new name before = in {place}, got {name}, which is taken; use another.")
+        self._places[name] = self._place_of(expression, place)
+
+    def _place_of(self, node: ast.AST, where: str) -> int:
+        """The place of an expression's result, with the instructions that it takes."""
+        match node:
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+                return self._constant(float(value))
+            case ast.Name(id=name) if name in self._places:
+                return self._places[name]
+            case ast.Name(id=name) if name in CONSTANTS:
+                return self._constant(CONSTANTS[name])
+            case ast.Name(id=name):
+                hint = did_you_mean(name, [*self._places, *CONSTANTS], "define it in a line before.")
+                raise UsageError(
+                    f"Expected a state, control, parameter or an earlier name in {where}, got {name}; {hint}"
+                )
+            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+                return self._place_of(operand, where)
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _SIGNS:
+                return self._instruction(_SIGNS[type(op)], [operand], where)
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _SIGNS:
+                return self._instruction(_SIGNS[type(op)], [left, right], where)
+            case ast.BoolOp(op=op, values=[first, *others]):
+                place = self._place_of(first, where)
+                for other in others:
+                    place = self._add(_SIGNS[type(op)], (place, self._place_of(other, where)))
+                return place
+            case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in _SIGNS:
+                return self._instruction(_SIGNS[type(op)], [left, right], where)
+            case ast.IfExp(test=condition, body=body, orelse=otherwise):
+                return self._instruction("where", [condition, body, otherwise], where)
+            case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]):
+                return self._call(name, operands, where)
+        written = ast.unparse(node)[:60]
+        hint = "write a**b for a power" if "^" in written else "write it with + - * / ** and functions"
+        raise UsageError(f"Expected an expression of numbers in {where}, got {written!r}; {hint}.")
+
+    def _call(self, name: str, operands: Sequence[ast.AST], where: str) -> int:
+        if name not in FUNCTIONS:
+            hint = did_you_mean(name, FUNCTIONS, f"there are {', '.join(FUNCTIONS)}.")
+            raise UsageError(f"Expected a known function in {where}, got {name}; {hint}")
+        count = FUNCTIONS[name].operands
+        if name in ("min", "max") and len(operands) > count:
+            places = [self._place_of(each, where) for each in operands]
+            return functools.reduce(lambda a, b: self._add(name, (a, b)), places)
+        if len(operands) != count:
+            raise UsageError(f"Expected {name} of {count} numbers in {where}, got {len(operands)}; correct the line.")
+        return self._instruction(name, operands, where)
+
+    def _instruction(self, operation: str, operands: Sequence[ast.AST], where: str) -> int:
+        return self._add(operation, tuple(self._place_of(each, where) for each in operands))
+
+    def _constant(self, value: float) -> int:
+        place = self._known.setdefault(value, self._size)
+        if place == self._size:
+            self.constants[place] = value
+            self._size += 1
+        return place
+
+    def _add(self, operation: str, operands: tuple[int, ...]) -> int:
+        if len(self.instructions) >= MOST_OPERATIONS:
+            raise UsageError(f"Expected {self.where} of at most {MOST_OPERATIONS} operations, got more; simplify them.")
+        place = self._known.setdefault((operation, operands), self._size)
+        if place == self._size:
+            self.instructions[place] = Instruction(operation, operands)
+            self._size += 1
+        return place
+
+
+def _require_names(names: Sequence[str], where: str) -> None:
+    for name in names:
+        if not name.isidentifier() or name in FUNCTIONS or name in CONSTANTS or name in ("der", "and", "or", "not"):
+            raise UsageError(
+                f"Expected names that {where} can use, of letters, digits and _, got {name!r}; give it another one."
+            )
+    if twice := [name for k, name in enumerate(names) if name in names[:k]]:
+        raise UsageError(f"Expected different names in {where}, got {twice[0]} twice; rename one.")
+
+
+def _assignment(line: str, place: str) -> tuple[str, ast.AST]:
+    """The name before =, `der(state)` included, and the expression after it."""
+    left, equals, right = line.partition("=")
+    left, right = "".join(left.split()), right.strip()
+    state = left[4:-1] if left.startswith("der(") and left.endswith(")") else left
+    try:
+        if not equals or not state.isidentifier():
+            raise SyntaxError
+        return left, ast.parse(right, mode="eval").body
+    except (SyntaxError, ValueError) as error:
+        raise UsageError(
+            f"Expected name = expression, or der(state) = expression, in {place}, got {line[:60]!r}; correct the line."
+        ) from error
+
+
+def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Number:
+    """The result of an operation: a float if all operands are."""
+    if not any(isinstance(each, Tensor) for each in operands):
+        with np.errstate(all="ignore"):
+            return float(_OPERATIONS[operation].of_numbers(*map(np.float64, operands)))
+    if operation == "**" and isinstance(operands[1], float):
+        exponent = operands[1]
+        return _as_number(operands[0], like) ** (int(exponent) if exponent.is_integer() else exponent)
+    if operation in ("+", "-", "*", "/", "**", "negative"):
+        return _OPERATIONS[operation].of_tensors(*(_as_number(each, like) for each in operands))
+    if operation in _COMPARISONS:
+        return _OPERATIONS[operation].of_tensors(*(_as_number(each, like) for each in operands))
+    if operation in _LOGICAL:
+        return _OPERATIONS[operation].of_tensors(*(_as_condition(each, like) for each in operands))
+    if operation == "where":
+        condition, *values = operands
+        return torch.where(_as_condition(condition, like), *(_tensor(_as_number(each, like), like) for each in values))
+    return _OPERATIONS[operation].of_tensors(*(_tensor(_as_number(each, like), like) for each in operands))
+
+
+def _affine_result(operation: str, operands: Sequence[Affine], like: Tensor) -> Affine | None:
+    """The result of an operation on numbers that are affine in u; None if it is not affine."""
+    rests = [each.rest for each in operands]
+    if not any(each.slopes for each in operands):
+        return Affine(_computed(operation, rests, like), {})
+
+    def scaled(slopes: Mapping[int, Number], by: str, factor: Number) -> dict[int, Number]:
+        return {j: _computed(by, [slope, factor], like) for j, slope in slopes.items()}
+
+    match operation:
+        case "+" | "-":
+            a, b = operands
+            slopes = dict(a.slopes)
+            for j, slope in b.slopes.items():
+                slopes[j] = _computed(operation, [slopes.get(j, 0.0), slope], like)
+        case "negative":
+            slopes = {j: _computed("negative", [slope], like) for j, slope in operands[0].slopes.items()}
+        case "*" if not operands[0].slopes or not operands[1].slopes:
+            a, b = operands if operands[0].slopes else operands[::-1]
+            slopes = scaled(a.slopes, "*", b.rest)
+        case "/" if not operands[1].slopes:
+            slopes = scaled(operands[0].slopes, "/", operands[1].rest)
+        case "where" if not operands[0].slopes:
+            condition, a, b = operands
+            slopes = {
+                j: _computed("where", [condition.rest, a.slopes.get(j, 0.0), b.slopes.get(j, 0.0)], like)
+                for j in {**a.slopes, **b.slopes}
+            }
+        case _:
+            return None
+    return Affine(_computed(operation, rests, like), slopes)
+
+
+def _tensor(value: Number, like: Tensor) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.full_like(like, value)
+
+
+def _filled(value: Number, like: Tensor) -> Tensor:
+    """A number as a tensor of the whole batch."""
+    value = _as_number(value, like)
+    return value.expand_as(like) if isinstance(value, Tensor) else torch.full_like(like, value)
+
+
+def _as_number(value: Number, like: Tensor) -> Number:
+    """1 and 0 for a condition that holds or does not; other numbers as they are."""
+    return value.to(like.dtype) if isinstance(value, Tensor) and value.dtype == torch.bool else value
+
+
+def _as_condition(value: Number, like: Tensor) -> Tensor:
+    """Whether a number is not 0."""
+    value = _tensor(value, like)
+    return value if value.dtype == torch.bool else value != 0

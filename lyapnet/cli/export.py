@@ -13,7 +13,7 @@ from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimato
 @of_a_controller
 def export(
     given: Given,
-    to: Annotated[str, typer.Option(help="c, fmu, onnx or torch.")],
+    to: Annotated[str, typer.Option(help="c, fmu, onnx, torch or casadi.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
     name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
     beyond: Annotated[
@@ -33,8 +33,9 @@ def export(
 
     c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. fmu is a unit for
     co-simulation with that C inside. onnx is a model (t, x) ↦ (u, V) of one state, with p beside x for a family; torch
-    is the same for torch.export.load. With --estimator c and fmu have the loop, readings y ↦ u with a step for each Δt,
-    held against Python's over 10 000 steps.
+    is the same for torch.export.load, and casadi a function (t, x) ↦ (u, V, V_x) for casadi.Function.load. With
+    --estimator c and fmu have the loop, readings y ↦ u with a step for each Δt, held against Python's over 10 000
+    steps.
     """
     from lyapnet.exchange.export import export as write
 

@@ -1,4 +1,4 @@
-"""The law as one graph (t, x[, p]) ↦ (u, V): an ONNX model, or a program of torch.export."""
+"""The law as one graph (t, x[, p]) ↦ (u, V): an ONNX model, a program of torch.export, or a CasADi function."""
 
 import copy
 import importlib
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.fx import GraphModule, Node
 
-from lyapnet.base.errors import ExportError, LyapnetError, one_line
+from lyapnet.base.errors import ExportError, LyapnetError, OracleError, one_line
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Evaluate
 from lyapnet.graphs.tracing import name_of
@@ -175,6 +175,46 @@ def run_onnx(path: Path, law: Law) -> Evaluate:
     def evaluate(t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
         u, V = zip(*map(answer, t, x), strict=True)
         return np.stack(u), np.stack(V)
+
+    return evaluate
+
+
+def casadi_function_of(law: Law) -> Any:
+    """The law as a CasADi function (t, x[, p]) ↦ (u, V, V_x), with the derivative that CasADi makes of V.
+
+    Raises:
+        ExportError: CasADi is missing, or an operation has no counterpart in it.
+    """
+    try:
+        import casadi
+
+        from lyapnet.graphs.casadi_functions import symbolic
+    except ImportError as error:
+        raise ExportError(f"Expected CasADi, got {error}; pip install 'lyapnet[oracle]'.") from error
+    try:
+        translated = symbolic(law.both, list(law.arguments.values()))
+    except OracleError as error:
+        raise ExportError(str(error)) from error
+    arguments = [casadi.SX.sym(name, argument.numel()) for name, argument in law.arguments.items()]
+    u, V = translated.call(arguments)
+    gradient = casadi.gradient(V, arguments[1])
+    return casadi.Function("law", arguments, [u, V, gradient], [*law.arguments], [*RESULTS, "V_x"])
+
+
+def write_casadi(function: Any, path: Path, about: dict[str, Any]) -> None:
+    """A file for `casadi.Function.load`, which has no place for what it is about."""
+    function.save(str(path))
+
+
+def run_casadi(path: Path, law: Law) -> Evaluate:
+    """What a saved CasADi function says of many states at once."""
+    import casadi
+
+    function = casadi.Function.load(str(path))
+
+    def evaluate(t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
+        u, V, _ = function.map(len(t)).call([np.atleast_2d(part.T) for part in law.given(t, x)])
+        return np.asarray(u).T, np.asarray(V).ravel()
 
     return evaluate
 

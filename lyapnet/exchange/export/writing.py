@@ -18,11 +18,18 @@ from lyapnet.exchange.export.facts import facts_of
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Agreement, points, verify
 
-FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
+FORMATS = {
+    "c": "",
+    "fmu": ".fmu",
+    "onnx": ".onnx",
+    "torch": ".pt2",
+    "casadi": ".casadi",
+}  # ↦ how a file's name ends; c is a folder
 IN_C = ("c", "fmu")
 PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
+    "casadi": (programs.casadi_function_of, programs.write_casadi, programs.run_casadi),
 }
 
 
@@ -55,7 +62,8 @@ def export(
         exported: a controller; or a controller with its estimator, of controller.with_estimator("ekf").
         path: of a folder for c, of a file for the others.
         to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; onnx, a model
-            (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load.
+            (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load; casadi, a function with V_x too,
+            for casadi.Function.load.
         checkpoint: that the controller was loaded from, whose digest is then noted.
         name: what the names in C begin with: several laws in one program need several.
         dtype: of the numbers in C, float64 or float32.

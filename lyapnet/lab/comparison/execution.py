@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from lyapnet.lab.comparison.baselines.training import BaselineTraining, best_pol
 from lyapnet.lab.comparison.controller_policy import ControllerPolicy
 from lyapnet.lab.comparison.plan import RESULT, Job
 from lyapnet.lab.comparison.planners import PlannerPolicy, planner_of
-from lyapnet.lab.comparison.results import OURS, PLANNED, ControlTimes, Measurement, Result
+from lyapnet.lab.comparison.results import OURS, PLANNED, WITH_VALUE, ControlTimes, Measurement, Result
 from lyapnet.lab.comparison.scoring import Costs, PathIncrements, costs_of, increments_of, optima_of
 from lyapnet.lab.comparison.timing import times_of_controller, times_of_policy
 from lyapnet.lab.sweep.points import Point
@@ -180,8 +180,12 @@ def _baseline(job: Job, console: Console) -> Result:
 
 def _planner(job: Job, console: Console) -> Result:
     bounded, states, increments = job.bounded, *_states(job)
+    controller = None
+    if job.method.startswith(WITH_VALUE):  # another job's, which waits for a process that is at it
+        trained = run_job(replace(job, method=OURS, seed=0), console)
+        controller = _controller(job, Path(trained.checkpoint))
     began = time.process_time()
-    policy = PlannerPolicy(planner_of(job.method, bounded.problem), bounded)
+    policy = PlannerPolicy(planner_of(job.method, bounded.problem, controller), bounded)
     prepared = time.process_time() - began
     costs = costs_of(policy, bounded, True, states, increments)
     console.print(f"{job.name}: mean cost {float(costs.cost.mean()):.4g}", soft_wrap=True)

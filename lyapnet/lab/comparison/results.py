@@ -13,7 +13,10 @@ from lyapnet.base.files import read_file, write_json
 
 OURS = "lyapnet"
 LEARNED = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
-PLANNED = ("rest", "lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100")  # from the model, without training; MPC: % of T
+WITH_VALUE = "mpc_V_"  # MPC of so many steps, whose terminal cost is the V of lyapnet's first seed
+PLANNED = (  # from the model, without training of their own; MPC without V: % of T
+    "rest", "lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100", f"{WITH_VALUE}5", f"{WITH_VALUE}10",
+)  # fmt: skip
 METHODS = (*LEARNED, *PLANNED)  # the order of tables and figures
 
 

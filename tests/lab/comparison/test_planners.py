@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import lyapnet
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import load_config
@@ -129,3 +130,17 @@ def test_a_result_keeps_its_times(tmp_path):
     )
     result.write(tmp_path / "result.json")
     assert Result.read(tmp_path / "result.json") == result
+
+
+@pytest.mark.gate
+def test_a_learned_value_makes_a_short_horizon_as_good_as_the_whole():
+    controller = lyapnet.load("zoo:pendulum_swingup")
+    bounded = bounded_problem(controller.problem, [20.0])
+    x0 = bounded.problem.initial_states.sample(2, torch.Generator().manual_seed(3)).double()
+    costs = []
+    for given in (controller, None):  # the twin has LQR's value in its place
+        policy = PlannerPolicy(planner_of("mpc_V_10", bounded.problem, given), bounded)
+        costs.append(costs_of(policy, bounded, True, x0).cost / optima_of(bounded, x0))
+        assert policy.unsolved_fraction == 0
+    assert float(costs[0].max()) < 1.001
+    assert float(costs[1].min()) > 1.01

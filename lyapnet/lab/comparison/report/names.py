@@ -1,5 +1,7 @@
 """Names of tasks and methods for readers."""
 
+from lyapnet.lab.comparison.results import WITH_VALUE
+
 ALGORITHMS = {"ppo": "PPO", "sac": "SAC"}
 PLANNERS = {"rest": "no control", "lqr": "LQR", "ilqr": "iLQR"}
 
@@ -12,6 +14,8 @@ def name_of(task: str) -> str:
 def method_name(method: str) -> str:
     """A method for readers: PPO (tuned), MPC (25 % of T)."""
     algorithm, _, setting = method.partition("_")
+    if method.startswith(WITH_VALUE):
+        return f"MPC ({method.removeprefix(WITH_VALUE)} steps + V)"
     if algorithm == "mpc":
         return f"MPC ({setting} % of T)"
     if algorithm in ALGORITHMS and setting:

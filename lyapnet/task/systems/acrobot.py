@@ -29,12 +29,13 @@ class Acrobot(MechanicalSystem):
     state_units = ("rad", "rad", "rad/s", "rad/s")
     control_names, control_units = ("elbow torque",), ("N·m",)
     angles = (0, 1)
+    dampings = ("damping", "damping")
 
     def __init__(self, mass: float = 1.0, length: float = 1.0, damping: float = 0.1, gravity: float = 9.81):
         require_positive(mass=mass, length=length, gravity=gravity)
         super().__init__(actuation=[[0.0], [1.0]], damping=[damping, damping])
         self.inertia, self.coupling = mass * length**2 / 3, mass * length**2 / 2
-        self.length, self.weight = length, mass * gravity * length / 2
+        self.length, self.damping, self.weight = length, damping, mass * gravity * length / 2
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         swing = self.coupling * torch.cos(q[..., 1])

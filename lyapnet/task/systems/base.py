@@ -258,6 +258,7 @@ class MechanicalSystem(ControlAffineSystem):
     Source: Tedrake, Underactuated Robotics, ch. 1.
     """
 
+    dampings: Sequence[str] = ()  # attributes with the entries of D, which families may then vary; none: D is constant
     B: Float[Tensor, "d m"]
     D: Float[Tensor, " d"]
 
@@ -276,6 +277,13 @@ class MechanicalSystem(ControlAffineSystem):
     def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         """h(q, q̇), (*batch, d): all forces but control and friction, in N or N·m."""
 
+    def friction(self, qdot: Coordinates) -> Coordinates:
+        """D q̇, (*batch, d), in N or N·m."""
+        if not self.dampings:
+            return self.D * qdot
+        rates = zip(self.dampings, qdot.unbind(-1), strict=True)
+        return torch.stack([getattr(self, name) * rate for name, rate in rates], -1)
+
     def kinetic_energy(self, q: Coordinates, qdot: Coordinates) -> PerState:
         """½ q̇ᵀM(q)q̇ in J."""
         return (apply(self.mass_matrix(q), qdot) * qdot).sum(-1) / 2
@@ -286,7 +294,7 @@ class MechanicalSystem(ControlAffineSystem):
 
     def _accelerate(self, q: Coordinates, qdot: Coordinates, force: Coordinates) -> State:
         """(q̇, q̈) under a generalised force, friction included."""
-        qddot = solve(self.mass_matrix(q), (force - self.D * qdot)[..., None])[..., 0]
+        qddot = solve(self.mass_matrix(q), (force - self.friction(qdot))[..., None])[..., 0]
         return torch.cat([qdot, qddot], -1)
 
     def f(self, x: State) -> State:

@@ -30,6 +30,7 @@ class Cartpole(MechanicalSystem):
     state_units = ("m", "rad", "m/s", "rad/s")
     control_names, control_units = ("force",), ("N",)
     angles = (1,)
+    dampings = ("cart_damping", "pole_damping")
 
     def __init__(
         self,
@@ -43,6 +44,7 @@ class Cartpole(MechanicalSystem):
         require_positive(cart_mass=cart_mass, pole_mass=pole_mass, length=length, gravity=gravity)
         super().__init__(actuation=[[1.0], [0.0]], damping=[cart_damping, pole_damping])
         self.cart_mass, self.pole_mass, self.length, self.gravity = cart_mass, pole_mass, length, gravity
+        self.cart_damping, self.pole_damping = cart_damping, pole_damping
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         coupling = self.pole_mass * self.length * torch.cos(q[..., 1])

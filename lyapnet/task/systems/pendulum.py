@@ -23,11 +23,12 @@ class Pendulum(MechanicalSystem):
     state_names, state_units = ("angle", "velocity"), ("rad", "rad/s")
     control_names, control_units = ("torque",), ("N·m",)
     angles = (0,)
+    dampings = ("damping",)
 
     def __init__(self, mass: float = 1.0, length: float = 1.0, damping: float = 0.0, gravity: float = 9.81):
         require_positive(mass=mass, length=length, gravity=gravity)
         super().__init__(actuation=[[1.0]], damping=[damping])
-        self.mass, self.length, self.gravity = mass, length, gravity
+        self.mass, self.length, self.damping, self.gravity = mass, length, damping, gravity
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         inertia = self.mass * self.length**2 + torch.zeros_like(q[..., 0])

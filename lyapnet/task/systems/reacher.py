@@ -34,6 +34,7 @@ class Reacher(MechanicalSystem):
     state_units = ("rad", "rad", "rad/s", "rad/s")
     control_names, control_units = ("shoulder torque", "elbow torque"), ("N·m", "N·m")
     angles = (0, 1)
+    dampings = ("damping", "damping")
 
     def __init__(self, a1: float = 0.196, a2: float = 0.048, a3: float = 0.045, damping: float = 0.25):
         require_positive(a1=a1, a2=a2, a3=a3)
@@ -42,7 +43,7 @@ class Reacher(MechanicalSystem):
                 f"Expected a3 (a1 − a3) > a2², got a1={a1}, a2={a2}, a3={a3}; no arm has such a mass matrix."
             )
         super().__init__(actuation=[[1.0, 0.0], [0.0, 1.0]], damping=[damping, damping])
-        self.a1, self.a2, self.a3 = a1, a2, a3
+        self.a1, self.a2, self.a3, self.damping = a1, a2, a3, damping
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         a2_cos = self.a2 * torch.cos(q[..., 1])

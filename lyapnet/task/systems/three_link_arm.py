@@ -27,12 +27,13 @@ class ThreeLinkArm(MechanicalSystem):
     state_units = ("rad",) * 3 + ("rad/s",) * 3
     control_names, control_units = ("shoulder torque", "elbow torque", "wrist torque"), ("N·m",) * 3
     angles = (0, 1, 2)
+    dampings = ("damping", "damping", "damping")
     c: Float[Tensor, "3 3"]
 
     def __init__(self, mass: float = 1.0, length: float = 0.5, damping: float = 0.25):
         require_positive(mass=mass, length=length)
         super().__init__([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]], [damping] * 3)
-        self.length = length
+        self.length, self.damping = length, damping
         c = torch.tensor([[7 / 3, 3 / 2, 1 / 2], [3 / 2, 4 / 3, 1 / 2], [1 / 2, 1 / 2, 1 / 3]])
         self.register_buffer("c", mass * length**2 * c.to(self.B), persistent=False)
 

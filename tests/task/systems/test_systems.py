@@ -180,8 +180,16 @@ def test_a_registered_system_that_cannot_be_built_fails(monkeypatch, build_syste
 
 def without_friction(system):
     if isinstance(system, MechanicalSystem):
-        system.D.zero_()
+        damp(system, torch.zeros(system.n // 2))
     return system
+
+
+def damp(system, damping):
+    """Give a system another damping of each rate; returns it, as one parameter may be that of several."""
+    system.D.copy_(damping)
+    for name, value in zip(system.dampings, damping.tolist(), strict=False):
+        setattr(system, name, value)
+    return torch.tensor([getattr(system, name) for name in system.dampings]) if system.dampings else damping
 
 
 def power(system, x, u):
@@ -215,10 +223,10 @@ def test_energy_is_conserved_without_friction_and_control(system):
 @pytest.mark.parametrize("system", MECHANICAL, indirect=True)
 def test_friction_and_control_change_the_energy_by_their_power(system):
     """Ė = q̇ᵀBu − q̇ᵀDq̇; with friction alone the conservation test fails."""
-    system.D.copy_(torch.linspace(0.1, 0.3, len(system.D)))
+    D = damp(system, torch.linspace(0.1, 0.3, system.n // 2))
     x, u = draw(system, 50)
     qdot = x[:, system.n // 2 :]
-    assert_close(power(system, x, u), (qdot * (u @ system.B.mT)).sum(-1) - (system.D * qdot**2).sum(-1))
+    assert_close(power(system, x, u), (qdot * (u @ system.B.mT)).sum(-1) - (D * qdot**2).sum(-1))
     assert drift_of_energy(system) > 1e-3
 
 

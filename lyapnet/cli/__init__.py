@@ -1,4 +1,4 @@
-"""The command line: lyapnet check | trim | train | evaluate | animate | view | export | sweep | tune | certify | …
+"""The command line: lyapnet check | trim | identify | train | evaluate | animate | view | export | sweep | tune | …
 
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
@@ -21,6 +21,7 @@ from lyapnet.cli.check import check
 from lyapnet.cli.compare import compare
 from lyapnet.cli.evaluate import evaluate
 from lyapnet.cli.export import export
+from lyapnet.cli.identify import identify
 from lyapnet.cli.sweep import sweep
 from lyapnet.cli.systems import systems
 from lyapnet.cli.train import train
@@ -46,7 +47,22 @@ def lyapnet(
         print(__version__)
 
 
-for command in (check, trim, train, evaluate, animate, view, export, sweep, tune, compare, systems, zoo, demo):
+for command in (
+    check,
+    trim,
+    identify,
+    train,
+    evaluate,
+    animate,
+    view,
+    export,
+    sweep,
+    tune,
+    compare,
+    systems,
+    zoo,
+    demo,
+):
     app.command()(command)
 for group in (certify, bench):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

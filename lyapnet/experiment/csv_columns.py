@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+from itertools import islice
 from pathlib import Path
 
 from lyapnet.base.errors import UsageError
@@ -12,39 +13,59 @@ LARGEST_CSV = 10_000_000  # bytes
 MOST_ROWS = 10_000
 
 
-def read_columns(path: Path) -> dict[str, list[float]]:
+def read_columns(
+    path: Path,
+    most_rows: int = MOST_ROWS,
+    largest: int = LARGEST_CSV,
+    advice: str = "begin with t and names of states",
+) -> dict[str, list[float]]:
     """Name ↦ numbers of each column.
+
+    Args:
+        most_rows: most rows of numbers.
+        largest: largest file, in bytes.
+        advice: what the first row has to say, for messages.
 
     Raises:
         UsageError: no such file, no names, a name twice, a row of another length, or an entry that is no finite number;
             names the line.
     """
     try:
-        text = read_file(path, LARGEST_CSV).decode("utf-8-sig")
+        text = read_file(path, largest).decode("utf-8-sig")
     except OSError as error:
-        raise UsageError(f"Expected a CSV file, got {str(path)!r} ({error.strerror or error}).") from error
+        raise UsageError(
+            f"Expected a CSV file, got {str(path)!r} ({error.strerror or error}); correct the name."
+        ) from error
     except (UnicodeDecodeError, ValueError) as error:
-        raise UsageError(f"Expected a CSV file of text below {LARGEST_CSV // 10**6} MB, got {str(path)!r}.") from error
+        raise UsageError(
+            f"Expected a CSV file of text below {largest // 10**6} MB, got {str(path)!r}; give less of it."
+        ) from error
     try:
-        rows = [row for row in csv.reader(io.StringIO(text), skipinitialspace=True) if row]
+        read = (row for row in csv.reader(io.StringIO(text), skipinitialspace=True) if row)
+        rows = list(islice(read, most_rows + 2))  # one more than there may be
     except csv.Error as error:
         raise UsageError(f"Expected a CSV file, got {str(path)!r} ({error}); separate numbers by commas.") from error
     names = [name.strip() for name in rows[0]] if rows else []
-    if len(rows) < 3 or len(set(names)) < len(names) or not all(names) or len(rows) > MOST_ROWS + 1:
+    if len(rows) < 3 or len(set(names)) < len(names) or not all(names) or len(rows) > most_rows + 1:
         raise UsageError(
-            f"Expected a row of different names and 2 to {MOST_ROWS} rows of numbers in {str(path)!r}, got "
-            f"{len(rows)} rows, the first {', '.join(names[:8])}; begin with t and names of states."
+            f"Expected a row of different names and 2 to {most_rows} rows of numbers in {str(path)!r}, got "
+            f"{len(rows)} rows{' and more' * (len(rows) > most_rows + 1)}, the first {', '.join(names[:8])}; {advice}."
         )
     columns: dict[str, list[float]] = {name: [] for name in names}
     for line, row in enumerate(rows[1:], 2):
         if len(row) != len(names):
-            raise UsageError(f"Expected {len(names)} numbers in row {line} of {str(path)!r}, got {len(row)}.")
+            raise UsageError(
+                f"Expected {len(names)} numbers in row {line} of {str(path)!r}, got {len(row)}; complete it."
+            )
         for name, entry in zip(names, row, strict=True):
             try:
                 number = float(entry)
             except ValueError:
                 number = math.nan
             if not math.isfinite(number):
-                raise UsageError(f"Expected finite numbers in {str(path)!r}, got {entry!r} for {name} in row {line}.")
+                raise UsageError(
+                    f"Expected finite numbers in {str(path)!r}, got {entry[:60]!r} for {name} in row {line}; "
+                    "correct it."
+                )
             columns[name].append(number)
     return columns

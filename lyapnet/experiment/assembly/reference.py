@@ -17,7 +17,7 @@ from lyapnet.task.family import FamilyCost, InterpolatedTargets
 from lyapnet.task.problem import TRIED
 from lyapnet.task.reference import TimedSystem
 from lyapnet.task.sets import Box, ControlSet
-from lyapnet.task.systems import ControlSystem
+from lyapnet.task.systems import ControlSystem, states_that_are_rates
 from lyapnet.value.derivatives import jacobian_of
 
 COUNTS = (9, 17, 33, 65, 129)  # numbers of functions that r is a sum of; the first is taken that is accurate
@@ -199,14 +199,7 @@ def _fit(
 def _rates_of(system: ControlSystem, initial_states: Box, given: Mapping[int, np.ndarray]) -> dict[int, int]:
     """Index of a state that is not given ↦ that of the given one whose rate it is, such as velocity ↦ position."""
     x = initial_states.sample(TRIED, torch.Generator().manual_seed(0)).double()
-    x = x + torch.rand(x.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)  # fixed states too
-    f, g = system.f(x).expand_as(x), system.g(x)
-    return {
-        i: j
-        for i in range(system.n)
-        for j in range(system.n)
-        if i not in given and j in given and torch.equal(f[:, j], x[:, i]) and not bool(g[..., j, :].any())
-    }
+    return {i: j for i, j in states_that_are_rates(system, x) if i not in given and j in given}
 
 
 def _following_control(system: ControlSystem, path: _Curve, tau: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from lyapnet.task.systems.base import (
     MechanicalSystem,
     functions_of_state,
     moving_states,
+    states_that_are_rates,
 )
 from lyapnet.task.systems.cartpole import Cartpole
 from lyapnet.task.systems.equations import EquationSystem
@@ -72,4 +73,5 @@ __all__ = [
     "functions_of_state",
     "is_linear",
     "moving_states",
+    "states_that_are_rates",
 ]

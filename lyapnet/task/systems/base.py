@@ -250,6 +250,19 @@ def functions_of_state(system: ControlSystem, u: Control) -> dict[str, Callable[
     return {"dynamics(x, u)": lambda x: system.dynamics(x, u.to(x).expand(*x.shape[:-1], -1))}
 
 
+def states_that_are_rates(system: ControlSystem, x: State) -> list[tuple[int, int]]:
+    """Pairs (i, j) of states with ẋ_j = x_i whatever the control, such as velocity and position.
+
+    Args:
+        x: some states (b, n).
+    """
+    generator = torch.Generator().manual_seed(1)
+    x = x + torch.rand(x.shape, generator=generator, dtype=torch.float64).to(x)  # states that do not differ too
+    u = torch.rand(*x.shape[:-1], system.m, generator=generator, dtype=torch.float64).to(x)
+    rates = system.dynamics(x, u)
+    return [(i, j) for i in range(system.n) for j in range(system.n) if torch.equal(rates[:, j], x[:, i])]
+
+
 class MechanicalSystem(ControlAffineSystem):
     """M(q)q̈ = Bu + h(q, q̇) − D q̇ with x = (q, q̇): the manipulator equation.
 

@@ -1,0 +1,101 @@
+"""lyapnet identify."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from lyapnet.base.errors import UsageError
+from lyapnet.cli.options import Debug, stages_of
+
+
+def identify(
+    config: Annotated[Path, typer.Argument(help="The experiment, a YAML file.", metavar="CONFIG")],
+    data: Annotated[
+        list[str],
+        typer.Argument(help="CSV files with t, controls and readings; and changes to the config.", metavar="DATA.csv…"),
+    ],
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(help="What is sought; else the numbers in system.parameters.", metavar="NAME,NAME,…"),
+    ] = None,
+    test: Annotated[
+        list[Path] | None, typer.Option(help="A file that is held out, once or more.", metavar="FILE.csv")
+    ] = None,
+    held_out: Annotated[
+        float | None,
+        typer.Option(min=0, max=0.9, help="Share of each file that is held out, its end; 0.25, or 0 with --test."),
+    ] = None,
+    family: Annotated[
+        bool, typer.Option("--family", help="Write the ranges as a family, in the place of randomise.")
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="The YAML file, and the figure beside it; CONFIG_identified.yaml if none.", metavar="FILE.yaml"
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Fit parameters of a system to measurements, say how well these tell them, and write a config that goes on.
+
+    Columns are named as states, or outputs, and controls; [deg] and the like behind a name is converted.
+
+    lyapnet identify conf/pendulum_limited.yaml swing.csv --parameters mass,length,damping
+    lyapnet identify conf/cartpole_outputs.yaml first.csv second.csv --test third.csv
+    """
+    overrides = [each for each in data if "=" in each and not Path(each).is_file()]
+    files = [Path(each) for each in data if each not in overrides]
+    target = config.with_name(f"{config.stem}_identified.yaml") if out is None else out
+    if not files:
+        raise UsageError("Expected CSV files of measurements behind the config, got none; name one or more.")
+    if target.suffix not in (".yaml", ".yml") or not target.parent.is_dir() or target.resolve() == config.resolve():
+        raise UsageError(
+            f"Expected --out as another YAML file in a folder that exists, got {str(target)!r}; choose such a name."
+        )
+    with stages_of("identify") as report:
+        report("importing torch")
+        import torch
+
+        from lyapnet.base.files import write_atomically
+        from lyapnet.experiment.config import load_config
+        from lyapnet.lab.identification import identify as find
+        from lyapnet.lab.identification import read_measurements, system_of
+        from lyapnet.lab.identification.figure import measured_and_fitted
+        from lyapnet.lab.identification.report import identified_yaml
+
+        resolved = load_config(config, overrides)
+        torch.set_num_threads(resolved.training.threads)
+        system, _ = system_of(resolved)
+        report("reading data")
+        given, held = ([read_measurements(path, system) for path in many] for many in (files, test or []))
+        names = [name.strip() for each in parameters or [] for name in each.split(",") if name.strip()]
+        found = find(resolved, given, names, held, held_out, report)
+        report("writing")
+        key = "family" if family else "randomise"
+        text, note = identified_yaml(config, overrides, resolved, found, target, key, [path.name for path in files])
+        write_atomically(target, text.encode())
+        picture = target.with_suffix(".png")
+        measured_and_fitted(found).savefig(picture, dpi=150)
+        report.rest()
+    unread = [f"{each.name}: columns that are not read: {', '.join(each.unread)}" for each in given if each.unread]
+    _tell(found, f"{config.name}, from {', '.join(path.name for path in files)}", [*unread, note], as_json, files)
+    notes = Console(stderr=as_json, highlight=False, markup=False)
+    notes.print(f"wrote {target} and {picture}", soft_wrap=True)
+
+
+def _tell(found: Any, title: str, notes: list[str], as_json: bool, files: list[Path]) -> None:
+    """Print tables and sentences, or one JSON object."""
+    from lyapnet.lab.identification import report
+
+    if as_json:
+        print(json.dumps(report.as_json(found, list(map(str, files))), ensure_ascii=False))
+        return
+    console = Console(highlight=False, markup=False)
+    console.print(report.parameter_table(found, title))
+    console.print(report.reading_table(found))
+    for line in filter(None, [*notes, *report.sentences(found)]):
+        console.print(line, soft_wrap=True)

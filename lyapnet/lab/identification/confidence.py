@@ -1,0 +1,45 @@
+"""How well readings tell parameters: their covariance, and the directions in which they are not told."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lyapnet.lab.identification.estimation import Solution
+
+NOT_AT_ALL = 1e-7  # singular value, relative to the greatest, from which effects of parameters count as the same
+ALIKE = 0.02  # share to which effects cancel in a direction that may be hardly told
+PART = 0.03  # square of the smallest part of a parameter in a direction by which it is not told, in units of its effect
+NAMED = 0.01  # smallest part of a parameter in a direction, relative to the greatest, that is named
+
+Array = np.ndarray
+
+
+class Confidence(NamedTuple):
+    """What readings tell of p."""
+
+    covariance: Float[Array, "k k"]  # along what is told
+    told: Bool[Array, " k"]
+    directions: list[dict[str, float]]  # relative changes by name that are not told
+
+
+def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[str]) -> Confidence:
+    """The covariance (MᵀM)⁻¹ of the parameters at a minimum, in the directions that readings tell.
+
+    In units of what each parameter does by itself, ‖∂ŷ/∂p_i‖, a direction in which effects cancel has a small singular
+    value s, and 1/s is its standard deviation. It is not told if s is 0 up to rounding, nor if effects cancel to ALIKE
+    and a standard deviation changes some parameter by all of its value.
+    """
+    p, size = found.point.p, np.where(found.size > 0, found.size, 1.0)
+    _, s, V = np.linalg.svd(found.root / size, full_matrices=False)
+    scale = np.where(p != 0, np.abs(p), np.abs(before))
+    relative = V / size / np.where(scale > 0, scale, 1 / size)
+    far = np.abs(relative).max(1) > s
+    known = (s > NOT_AT_ALL * s[0]) & ~((s < ALIKE) & far)
+    directions = list[dict[str, float]]()
+    for change in relative[~known]:
+        change = change / change[np.argmax(np.abs(change))]
+        directions.append({name: float(c) for name, c in zip(names, change, strict=True) if abs(c) > NAMED})
+    root = V[known] / size / s[known, None]
+    return Confidence(root.T @ root, (V[~known] ** 2).sum(0) < PART**2, directions)

@@ -1,0 +1,209 @@
+"""What was identified, as tables, sentences, JSON and the YAML file that goes on with it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from rich.table import Table
+
+from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.files import plain
+from lyapnet.experiment.assembly.family import members_of
+from lyapnet.experiment.config import Config, config_from_plain
+from lyapnet.experiment.schema import read_yaml
+from lyapnet.lab.identification.residuals import LEVEL, ResidualTest
+from lyapnet.lab.identification.results import Estimate, Identification
+from lyapnet.lab.identification.unknown_system import system_of
+
+DIGITS = 6  # of estimates in tables
+WIDTH = 120  # of lines of YAML
+WIDE = 0.5  # half of an interval relative to the value, beyond which the data hardly tell a parameter
+
+
+def parameter_table(found: Identification, title: str) -> Table:
+    """A row for each parameter."""
+    table = Table("parameter", "in the config", "estimate", "95 % interval", "±", title=title)
+    for name, one in found.parameters.items():
+        table.add_row(name, f"{one.before:.{DIGITS}g}", f"{one.value:.{DIGITS}g}", _interval(one), _half(one))
+    return table
+
+
+def reading_table(found: Identification) -> Table:
+    """A row for each reading."""
+    table = Table("reading", "noise σ", "fit", "held out", "residuals")
+    for test in found.tests:
+        name = test.reading
+        unit = f" ({found.units[name]})" if found.units[name] else ""
+        later = f"{found.fit_held_out[name]:.2%}" if found.fit_held_out else "–"
+        table.add_row(f"{name}{unit}", f"{found.noise[name]:.4g}", f"{found.fit[name]:.2%}", later, verdict(test))
+    return table
+
+
+def verdict(test: ResidualTest) -> str:
+    """What a test says, in a few words."""
+    found = list[str]()
+    if test.white < LEVEL:
+        found.append(f"correlated over {test.correlated + 1} samples ({_probability(test.white)})")
+    if test.controls is not None and test.controls < LEVEL:
+        found.append(f"follow the controls ({_probability(test.controls)})")
+    if test.size is not None and test.ratio is not None and test.size < LEVEL:
+        found.append(f"{test.ratio:.3g} times the noise ({_probability(test.size)})")
+    return "; ".join(found) or f"white ({_probability(test.white)})"
+
+
+def sentences(found: Identification) -> list[str]:
+    """What a reader has to know beside the tables."""
+    told = list[str]()
+    for direction in found.unknown_directions:
+        changes = ", ".join(
+            f"{name} {change:+.2%}".replace("-", "−") for name, change in _in_percent(direction).items()
+        )
+        if len(direction) == 1:
+            (name,) = direction
+            told.append(f"not told: {name} has no effect on these data; leave it out of --parameters.")
+        else:
+            told.append(
+                f"not told: {changes} together leave these data as they are; leave one of them out of --parameters."
+            )
+    for name, one in found.parameters.items():
+        if one.at_bound:
+            told.append(f"{name} is at the end of what the system takes; its interval is rough.")
+        elif one.told and one.high - one.low > 2 * WIDE * abs(one.value):
+            told.append(f"hardly told: {name}; a motion in which it counts for more would tell it.")
+    dynamic = [test.reading for test in found.tests if not _explains(test)]
+    if dynamic:
+        told.append(
+            f"the model does not explain {', '.join(dynamic)}: a right one leaves noise alone. Intervals are too "
+            "narrow; free further parameters, or add what is missing (friction, a delay, a sensor's lag)."
+        )
+    elif wrong := [test for test in found.tests if not test.passed]:
+        listed = ", ".join(f"{found.noise[test.reading] * (test.ratio or 1):.3g} of {test.reading}" for test in wrong)
+        told.append(f"the noise is another one than outputs.noise says: {listed}; correct it.")
+    if found.pieces > 1:
+        told.append(f"fitted in {found.pieces} pieces, each from a state of its own.")
+    return told
+
+
+def _explains(test: ResidualTest) -> bool:
+    return test.white >= LEVEL and (test.controls is None or test.controls >= LEVEL)
+
+
+def _in_percent(direction: Mapping[str, float]) -> dict[str, float]:
+    """A direction with a smallest change of one percent."""
+    least = min(abs(change) for change in direction.values())
+    return {name: 0.01 * change / least for name, change in direction.items()}
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2f}" if p >= 0.01 else f"p = {p:.0e}" if p > 1e-12 else "p < 1e-12"
+
+
+def _interval(one: Estimate) -> str:
+    if not one.told:
+        return "not told"
+    low, high = rounded_interval(one.low, one.high)
+    return f"[{low:.{DIGITS}g}, {high:.{DIGITS}g}]"
+
+
+def _half(one: Estimate) -> str:
+    if not one.told or one.value == 0:
+        return "–"
+    return f"{50 * (one.high - one.low) / abs(one.value):.2g} %"
+
+
+def rounded_interval(low: float, high: float) -> tuple[float, float]:
+    """An interval that contains a given one, with two digits of its width."""
+    if not high > low:
+        return low, high
+    unit = 10.0 ** (math.floor(math.log10(high - low)) - 1)
+    return float(f"{math.floor(low / unit) * unit:.12g}"), float(f"{math.ceil(high / unit) * unit:.12g}")
+
+
+def as_json(found: Identification, files: Sequence[str]) -> dict[str, Any]:
+    """Everything but the curves as plain data."""
+    return plain(
+        {
+            "files": [*files],
+            "parameters": {name: one._asdict() for name, one in found.parameters.items()},
+            "covariance": found.covariance.tolist(),
+            "unknown_directions": found.unknown_directions,
+            "noise": found.noise,
+            "fit": found.fit,
+            "fit_held_out": found.fit_held_out or None,
+            "residuals": [vars(test) for test in found.tests],
+            "model_is_right": found.model_is_right,
+            "pieces": found.pieces,
+            "degrees_of_freedom": found.freedom,
+        }
+    )
+
+
+def identified_yaml(
+    path: Path,
+    overrides: Sequence[str],
+    config: Config,
+    found: Identification,
+    out: Path,
+    key: str,
+    files: Sequence[str],
+) -> tuple[str, str]:
+    """The config with the estimates and their ranges as YAML, and what is to be said of these ranges.
+
+    Args:
+        path: of the config.
+        key: randomise or family, which gets the ranges.
+        files: names of the data.
+    """
+    told = {name: one for name, one in found.parameters.items() if one.told}
+    ranges = {name: [*rounded_interval(one.low, one.high)] for name, one in told.items()}
+    ranges = {name: ends for name, ends in ranges.items() if ends[1] > ends[0]}
+    values = {name: float(f"{one.value:.{DIGITS + 2}g}") for name, one in found.parameters.items()}
+    layers = OmegaConf.create(read_yaml(path, Config)), OmegaConf.from_dotlist(list(overrides))
+    content: Any = OmegaConf.to_container(OmegaConf.merge(*layers))
+    content["experiment"] = f"{config.experiment}_identified"
+    content.setdefault("system", {})["parameters"] = {**config.system.parameters, **values}
+    others = {name: ends for name, ends in config.family.items() if name not in found.parameters}
+    refused = _refusal(config, values, ranges, key, others)
+    note = f"{key}: not written, as {refused}" if refused else ""
+    if not refused:
+        content.pop("randomise", None)
+        content[key] = {**ranges, **(others if key == "family" else {})}
+        if key == "randomise":
+            content.pop("family", None)
+    noise = ", ".join(f"{sigma:.3g}" for sigma in found.noise.values())
+    comments = [
+        f"lyapnet train --config {out}",
+        f"Identified from {', '.join(files)}: the values below, and 95 % intervals of each parameter by itself.",
+        f"outputs: {{measure: [{', '.join(found.noise)}], noise: [{noise}]}}",
+        *([] if found.model_is_right else ["The model does not explain these data: intervals are too narrow."]),
+        *([f"{key}: {ranges}  # {refused}"] if refused and ranges else []),
+    ]
+    config_from_plain(content)  # raises what would be refused later
+    text = "".join(f"# {' '.join(line.split())}\n" for line in comments) + yaml.safe_dump(
+        content, default_flow_style=None, sort_keys=False, allow_unicode=True, width=WIDTH
+    )
+    return text, note
+
+
+def _refusal(
+    config: Config, values: Mapping[str, float], ranges: Mapping[str, list[float]], key: str, others: Mapping[str, Any]
+) -> str:
+    """Why a config can have no such ranges; empty if it can."""
+    if not ranges:
+        return "the data tell no range"
+    beside = {
+        "family": config.family if others else {},
+        "noise": config.noise,
+        "horizon.stationary": config.horizon.stationary,
+    }
+    if key == "randomise" and (wrong := [name for name, given in beside.items() if given]):
+        return f"randomise goes without {wrong[0]}"
+    try:
+        system, box = system_of(config)
+        members_of(config, system, ranges, [""] * len(ranges), box, key)
+    except UsageError as error:
+        return one_line(error)
+    return ""

@@ -1,0 +1,190 @@
+"""The way to the estimates: short pieces of recordings first, then longer ones, and the noise of readings on the way.
+
+Short pieces follow the data whatever the parameters, and tell them roughly; with these, longer ones can be joined.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.experiment.assembly.entries import repeated
+from lyapnet.experiment.schema import joined
+from lyapnet.lab.identification.estimation import Fit, Point, Solution
+from lyapnet.lab.identification.measurements import Measurements
+from lyapnet.lab.identification.shooting import SEGMENT, Shooting
+from lyapnet.lab.identification.unknown_system import UnknownSystem
+from lyapnet.task.problem import TRIED
+from lyapnet.task.systems import states_that_are_rates
+from lyapnet.training.stage_messages import StageReport
+
+FIRST_PIECES, SHORTEST = 40, 40  # pieces of the first fit at most, and samples of each at least
+LONGER = 4  # times as long are the pieces of each further fit
+# A piece ends where an error of its initial state has grown by so much: readings beyond would tell parameters to more
+# digits than any plant has, as nothing is said here of what disturbs it on the way.
+GROWTH = 1e3
+MOST_UNKNOWNS = 1500  # parameters and initial states of pieces together; the time grows with their cube
+ROUNDS, SETTLED = 8, 0.01  # fits with new standard deviations of readings, until these change by less than so much
+LEAST_NOISE = 1e-9  # of readings, relative to their size
+ACCURATE, MOST_SUBSTEPS = 0.05, 64  # largest error of integration, in standard deviations of readings
+EXACT = 1e-6  # of data without noise: what counts as such a standard deviation, relative to the size of readings
+SMOOTHED = 7  # samples over which the rate of a reading is averaged for a first guess
+NOT_FINITE = "start from better values in system.parameters, or correct names and units of columns"
+
+Array = np.ndarray
+
+
+class Search:
+    """From a system and recordings to the minimum.
+
+    Args:
+        unknown: the system.
+        recordings: what is fitted.
+        report: is told what is done.
+    """
+
+    def __init__(self, unknown: UnknownSystem, recordings: Sequence[Measurements], report: StageReport):
+        self.unknown, self.recordings, self.report = unknown, recordings, report
+        self.model, self.readings = unknown.model, unknown.readings
+        self.bounds, self.known = unknown.bounds(), self._known_noise()
+        k, n, total = len(unknown.names), unknown.system.n, sum(len(each) for each in recordings)
+        if total * self.readings.count < 2 * (k + n * len(recordings)):
+            raise UsageError(
+                f"Expected more readings than twice the {k} parameters and {n} states of each file, got "
+                f"{total * self.readings.count}; give longer files, or a smaller share that is held out."
+            )
+
+    def run(self) -> tuple[Fit, Solution]:
+        """Fit short pieces, then longer and longer ones, and find the noise on the way."""
+        fit, length, start = self._short_pieces()
+        longest, found = max(len(each) for each in self.recordings), None
+        while length < LONGER * longest:
+            self.report("fitting pieces", min(length, longest), longest)
+            settled = self._settle(fit, start)
+            if settled is None and found is None:
+                raise LyapnetError(
+                    "Expected trajectories of the model that follow the data, got some that are not finite; "
+                    f"{NOT_FINITE}."
+                )
+            if settled is None:  # trajectories so long cannot be joined
+                break
+            length, found = LONGER * length, settled
+            fit, start = self._longer(*settled, length)
+        assert found is not None
+        return found
+
+    def shooting(self, pieces: Sequence[Measurements], substeps: int) -> Shooting:
+        unknowns = len(self.unknown.names) + self.unknown.system.n * len(pieces)
+        if unknowns > MOST_UNKNOWNS:
+            raise UsageError(
+                f"Expected at most {MOST_UNKNOWNS} unknowns, got {unknowns}: {len(self.unknown.names)} parameters, and "
+                f"{self.unknown.system.n} states at the start of {len(pieces)} pieces; give fewer or shorter files."
+            )
+        return Shooting(self.model, pieces, substeps)
+
+    def _short_pieces(self) -> tuple[Fit, int, Point]:
+        """Pieces that the config's model can follow from states near the readings, their length and their start."""
+        total = sum(len(each) for each in self.recordings)
+        count = max(1, -(-total // (FIRST_PIECES * SEGMENT)), SHORTEST // SEGMENT)  # segments of a piece
+        while count:
+            pieces = [piece for each in self.recordings for piece in each.pieces(count * SEGMENT)]
+            shooting = self.shooting(pieces, 1)
+            start = self.start(shooting, self.unknown.before)
+            if shooting(start.p, start.x0, start.nodes) is not None:
+                sigma = np.where(np.isnan(self.known), self._first_noise(), self.known)
+                return Fit(shooting, sigma, self.bounds, self.unknown.before), count * SEGMENT, start
+            count //= 2
+        raise LyapnetError(
+            f"Expected data that the config's model can follow for {SEGMENT} samples, got trajectories that are not "
+            f"finite; {NOT_FINITE}."
+        )
+
+    def start(self, shooting: Shooting, p: Array) -> Point:
+        """A point from what readings say of the states."""
+        states = [self._guess(piece) for piece in shooting.pieces]
+        return Point(p, np.stack([x[0] for x in states]), np.concatenate([x[::SEGMENT] for x in states]))
+
+    def _guess(self, piece: Measurements) -> Array:
+        """States at all samples, (N, n): readings, their rates, and the centre of X₀ for others."""
+        x = np.tile(self.unknown.box.center.double().numpy(), (len(piece), 1))
+        measured = {i: k for k, i in enumerate(self.readings.indices) if i < self.unknown.system.n}
+        for i, k in measured.items():
+            x[:, i] = np.unwrap(piece.y[:, k]) if i in self.unknown.system.angles else piece.y[:, k]
+        some = self.unknown.box.sample(TRIED, torch.Generator().manual_seed(0)).double()
+        for i, j in states_that_are_rates(self.unknown.system, some):
+            if j in measured and i not in measured and len(piece) > 2:
+                slope = np.gradient(x[:, j], piece.t)
+                width = min(SMOOTHED, (len(piece) - 1) // 2 * 2 + 1)
+                x[:, i] = np.convolve(np.pad(slope, width // 2, "edge"), np.full(width, 1 / width), "valid")
+        return x
+
+    def _longer(self, fit: Fit, found: Solution, length: int) -> tuple[Fit, Point]:
+        """Pieces of a length, or less where an error of the initial state has grown by GROWTH; and where they start."""
+        nodes, pieces = found.path.nodes, list[Measurements]()
+        scale = np.maximum(np.abs(nodes).max(0), 1e-12)
+        transitions = iter(found.path.transitions * scale / scale[:, None])
+        for recording in self.recordings:
+            begin, grown = 0, np.eye(self.unknown.system.n)
+            for end in range(SEGMENT, len(recording), SEGMENT):
+                grown = next(transitions) @ grown
+                full = end - begin >= length and len(recording) - end >= length // 2
+                if full or np.linalg.norm(grown, 2) > GROWTH:
+                    pieces.append(recording.part(begin, end))
+                    begin, grown = end, np.eye(self.unknown.system.n)
+            next(transitions)
+            pieces.append(recording.part(begin, len(recording)))
+        shooting = self.shooting(pieces, fit.shooting.substeps)
+        start = Point(found.point.p, nodes[shooting.first], nodes)
+        return Fit(shooting, self.noise(found), self.bounds, self.unknown.before), start
+
+    # Noise
+
+    def _first_noise(self) -> Array:
+        """The noise of readings by their third differences, in which smooth motion hardly counts; (q,)."""
+        differences = [np.diff(each.y, 3, 0) for each in self.recordings if len(each) > 3]
+        found = np.sqrt(np.mean(np.concatenate(differences) ** 2, 0) / 20)
+        return np.maximum(found, self._least_noise)
+
+    @property
+    def _least_noise(self) -> Array:
+        size = np.max([np.abs(each.y).max(0) for each in self.recordings], 0)
+        return LEAST_NOISE * np.where(size > 0, size, 1.0)
+
+    def noise(self, found: Solution) -> Array:
+        """The standard deviation of each reading, by the residuals where it is not known; (q,)."""
+        freedom = np.maximum(len(found.residuals) - found.leverage, 1.0)
+        estimated = np.sqrt((found.residuals**2).sum(0) / freedom)
+        return np.where(np.isnan(self.known), np.maximum(estimated, self._least_noise), self.known)
+
+    def _settle(self, fit: Fit, start: Point) -> tuple[Fit, Solution] | None:
+        """The minimum with the noise that it says itself, and with short enough steps; None: no trajectories."""
+        size = self._least_noise / LEAST_NOISE
+        for _ in range(ROUNDS):
+            found, shooting = fit.minimise(start), fit.shooting
+            if found is None:
+                return None
+            start, sigma = found.point, self.noise(found)
+            error = shooting.integration_error(found.path, start.p)
+            coarse = (error > ACCURATE * np.maximum(sigma, EXACT * size)).any() and shooting.substeps < MOST_SUBSTEPS
+            if coarse:
+                shooting = self.shooting(shooting.pieces, 2 * shooting.substeps)
+            elif (np.abs(sigma / fit.sigma - 1) < SETTLED).all():
+                break
+            fit = Fit(shooting, sigma, self.bounds, self.unknown.before)
+        return fit, found
+
+    def _known_noise(self) -> Array:
+        """The standard deviation of each reading that the config knows, NaN for others."""
+        outputs, known = self.unknown.config.outputs, np.full(self.readings.count, np.nan)
+        if outputs.noise is None:
+            return known
+        names = list(outputs.measure) or list(self.readings.names)
+        if not outputs.measure and self.unknown.system.has_output:
+            names = list(
+                getattr(self.unknown.system, "output_names", None)
+                or [f"reading {k + 1}" for k in range(len(outputs.noise))]
+            )
+        given = repeated(list(outputs.noise), len(names))
+        by_name = {joined(name): value for name, value in zip(names, given, strict=False)}
+        return np.array([by_name.get(joined(name), np.nan) for name in self.readings.names])

@@ -35,6 +35,7 @@ READERS = {  # what reads FILE
     "checkpoint": ["evaluate", "FILE", "--samples", "2"],
     "proof": ["view", ZOO, "--out", "page.html", "--proof", "FILE"],
     "onnx": ["certify", "region", "task.yaml", "--value", "FILE", "--law", "FILE", "--seconds", "1"],
+    "measurements": ["identify", "plant.yaml", "FILE", "--out", "found.yaml"],
     "points": ["train", "--config", "small.yaml", "pointwise.weight=1", "pointwise.counterexamples=FILE"],
 }
 TASK = """
@@ -48,6 +49,7 @@ cost: {Q: [1, 1], R: [1], Q_T: [1, 1]}
 initial_states: {lower: [-1, -1], upper: [1, 1]}
 horizon: {steps: 4, dt: 0.1}
 """
+PLANT = f"{TASK}horizon: {{steps: 4, dt: 0.1}}\n"
 
 
 class Answer(NamedTuple):
@@ -74,9 +76,10 @@ def _imported(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with two configs that are sound, and a module that leaves a mark when it is imported."""
+    """A folder with configs that are sound, and a module that leaves a mark when it is imported."""
     (tmp_path / "task.yaml").write_text(TASK)
     (tmp_path / "small.yaml").write_text(SMALL)
+    (tmp_path / "plant.yaml").write_text(PLANT)
     (tmp_path / "trap.py").write_text("import os\nos.mkdir('executed')\nclass Class: pass\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
@@ -201,6 +204,46 @@ POINTS = {
 def test_texts(reader, text, folder, capsys):
     (folder / "text").write_bytes(text.encode(errors="surrogateescape"))
     assert_refused(answer(reader, "text", capsys))
+
+
+# Measurements
+
+STEADY = "".join(f"{0.1 * k:g},0,0\n" for k in range(40))
+MEASUREMENTS = {  # a file ↦ what is said of it
+    "a huge field": (POINTS["a huge field"], "larger than field limit"),
+    "a quote": (POINTS["a quote"], "separate numbers by commas"),
+    "ragged": (POINTS["ragged"], "Expected 3 numbers in row 3"),
+    "no text": ("\udce9", "a CSV file of text"),
+    "41 million rows": ("t,torque,angle\n" + "\n" * 41_000_000, "more than 4e+07"),
+    "too many rows": ("t,torque,angle\n" + "0,0,0\n" * 200_001, "200002 rows and more"),
+    "three rows": ("t,torque,angle\n0,0,0\n1,0,0\n2,0,0\n", "more readings than twice"),
+    "no time": (f"a,torque,angle\n{STEADY}", "a column for t in"),
+    "no control": (
+        f"t,torq,angle\n{STEADY}",
+        "a column for torque in 'text', got 't, torq, angle'; did you mean torq?",
+    ),
+    "no reading": (f"t,torque,angel\n{STEADY}", "a column for one of angle, velocity"),
+    "a state twice": (f"t,angle,angle [deg],torque\n{STEADY.replace(',0,', ',0,0,')}", "Expected angle once"),
+    "unsorted": (f"t,torque,angle\n{STEADY}0.5,0,0\n", "got 0.5 s after 3.9 s in row 42"),
+    "a time twice": (f"t,torque,angle\n0,0,0\n{STEADY}", "got 0 s after 0 s in row 3"),
+    "another unit": (f"t,torque,angle [m]\n{STEADY}", "in a unit of its kind (rad, deg, °, rev), got 'm'"),
+    "not a number": (f"t,torque,angle\n{STEADY}9,0,nan\n", "got 'nan' for angle in row 42"),
+    "infinite": (f"t,torque,angle\n{STEADY}9,-inf,0\n", "got '-inf' for torque in row 42"),
+    "nothing": (f"t,torque,angle\n{STEADY}9,0,\n", "got '' for angle in row 42"),
+    "beyond": (f"t,torque,angle\n{STEADY}9,0,1e308\n", "numbers below 1e+30 for angle"),
+    "a step of years": (f"t,torque,angle\n-1e29,1e9,0\n{STEADY}", "Expected data that the config's model"),
+    "control characters": (f"t,torque,\x1b[31m\x07\n{STEADY}", "one of angle, velocity"),
+    "names": (",".join(map(str, range(100_000))), "got 1 rows"),
+}
+
+
+@pytest.mark.parametrize("kind", MEASUREMENTS)
+def test_measurements(kind, folder, capsys):
+    text, expected = MEASUREMENTS[kind]
+    (folder / "text").write_bytes(text.encode(errors="surrogateescape"))
+    got = answer("measurements", "text", capsys)
+    assert_refused(got)
+    assert expected in got.lines[0]
 
 
 # Archives

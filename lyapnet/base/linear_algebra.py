@@ -109,7 +109,7 @@ def symmetric_inverse(A: Tensor) -> Tensor:
 
 
 class _Inverse(torch.autograd.Function):
-    """symmetric_inverse with its derivatives, −A⁻ᵀ Ā A⁻ᵀ backwards and −A⁻¹ Ȧ A⁻¹ forwards."""
+    """symmetric_inverse with its derivative −A⁻ᵀ Ā A⁻ᵀ."""
 
     generate_vmap_rule = True
 
@@ -120,17 +120,11 @@ class _Inverse(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
         ctx.save_for_backward(output)
-        ctx.save_for_forward(output)
 
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> Tensor:
         (inverse,) = ctx.saved_tensors
         return -multiply(inverse.mT, multiply(bar, inverse.mT))
-
-    @staticmethod
-    def jvp(ctx: Any, dot: Tensor) -> Tensor:
-        (inverse,) = ctx.saved_tensors
-        return -multiply(inverse, multiply(dot, inverse))
 
 
 def has_values(x: Tensor) -> bool:

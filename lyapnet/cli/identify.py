@@ -81,7 +81,9 @@ def identify(
         picture = target.with_suffix(".png")
         measured_and_fitted(found).savefig(picture, dpi=150)
         report.rest()
-    unread = [f"{each.name}: columns that are not read: {', '.join(each.unread)}" for each in given if each.unread]
+    unread = [
+        f"{each.name}: columns that are not read: {', '.join(map(repr, each.unread))}" for each in given if each.unread
+    ]
     _tell(found, f"{config.name}, from {', '.join(path.name for path in files)}", [*unread, note], as_json, files)
     notes = Console(stderr=as_json, highlight=False, markup=False)
     notes.print(f"wrote {target} and {picture}", soft_wrap=True)

@@ -49,7 +49,8 @@ def read_columns(
     if len(rows) < 3 or len(set(names)) < len(names) or not all(names) or len(rows) > most_rows + 1:
         raise UsageError(
             f"Expected a row of different names and 2 to {most_rows} rows of numbers in {str(path)!r}, got "
-            f"{len(rows)} rows{' and more' * (len(rows) > most_rows + 1)}, the first {', '.join(names[:8])}; {advice}."
+            f"{len(rows)} rows{' and more' * (len(rows) > most_rows + 1)}, the first {', '.join(names[:8])[:200]!r}; "
+            f"{advice}."
         )
     columns: dict[str, list[float]] = {name: [] for name in names}
     for line, row in enumerate(rows[1:], 2):

@@ -1,4 +1,7 @@
-"""Measurements that nothing but the command line uses: their tests run at the gate."""
+"""Measurements that nothing but the command line uses: their tests run at the gate.
+
+Those of identification, whose results go into configs of users, run by default too.
+"""
 
 from pathlib import Path
 
@@ -10,5 +13,6 @@ HERE = Path(__file__).parent
 @pytest.hookimpl(tryfirst=True)  # before tests are deselected by their marks
 def pytest_collection_modifyitems(items):
     for item in items:
-        if item.path.is_relative_to(HERE) and item.get_closest_marker("nightly") is None:
+        measures = item.path.is_relative_to(HERE) and not item.path.is_relative_to(HERE / "identification")
+        if measures and item.get_closest_marker("nightly") is None:
             item.add_marker(pytest.mark.gate)

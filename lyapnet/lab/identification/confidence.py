@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from lyapnet.lab.identification.estimation import Solution
 
 NOT_AT_ALL = 1e-7  # singular value, relative to the greatest, from which effects of parameters count as the same
+NO_EFFECT = 1e-3  # of a change by all of its value on all readings together, in their noise: a parameter does not count
 ALIKE = 0.02  # share to which effects cancel in a direction that may be hardly told
 PART = 0.03  # square of the smallest part of a parameter in a direction by which it is not told, in units of its effect
 NAMED = 0.01  # smallest part of a parameter in a direction, relative to the greatest, that is named
@@ -31,9 +32,11 @@ def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[s
     value s, and 1/s is its standard deviation. It is not told if s is 0 up to rounding, nor if effects cancel to ALIKE
     and a standard deviation changes some parameter by all of its value.
     """
-    p, size = found.point.p, np.where(found.size > 0, found.size, 1.0)
-    _, s, V = np.linalg.svd(found.root / size, full_matrices=False)
+    p = found.point.p
     scale = np.where(p != 0, np.abs(p), np.abs(before))
+    counts = np.where(scale > 0, found.size * scale > NO_EFFECT, found.size > 0)
+    size = np.where(counts, found.size, 1.0)
+    _, s, V = np.linalg.svd(np.where(counts, found.root, 0.0) / size, full_matrices=False)
     relative = V / size / np.where(scale > 0, scale, 1 / size)
     far = np.abs(relative).max(1) > s
     known = (s > NOT_AT_ALL * s[0]) & ~((s < ALIKE) & far)

@@ -81,7 +81,7 @@ class Fit:
             np.concatenate([side[: self.k], sign * free]) for side, sign in zip(self.bounds, (-1, 1), strict=True)
         )
         found = least_squares(
-            self._residuals, np.clip(w, lower, upper), self._jacobian, (lower, upper), x_scale="jac",
+            self._residuals, np.clip(w, lower, upper), self._jacobian, (lower, upper), x_scale="jac",  # pyright: ignore
             ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=MOST_EVALUATIONS,
         )  # fmt: skip
         path = self._at(found.x)[0]
@@ -124,7 +124,7 @@ class Fit:
         pieces, width = len(self.shooting.pieces), n + k + 1
         residuals, jacobian = np.zeros(pieces * width + k), np.zeros((pieces * width + k, k + pieces * n))
         for i, part in enumerate(self._by_piece(np.concatenate([J[..., : n + k], r[..., None]], -1))):
-            R: Array = np.linalg.qr(part, mode="r")
+            R = _triangle(part)
             at = slice(i * width, i * width + len(R))
             residuals[at] = R[:, -1]
             jacobian[at, k + i * n : k + (i + 1) * n], jacobian[at, :k] = R[:, :n], R[:, n : n + k]
@@ -156,8 +156,7 @@ class Fit:
         faint = FAINT / np.maximum(np.abs(path.nodes).max(0), 1e-12)
         for part in parts:  # with x₀ known a little, so that directions that readings do not tell take nothing away
             whole = np.concatenate([part, np.eye(n, n + k) * faint[:, None]])
-            R: Array = np.linalg.qr(whole, mode="r")
-            roots.append(R[n:, n:])
+            roots.append(_triangle(whole)[n:, n:])
         root = np.concatenate(roots)
         size = np.linalg.norm(np.concatenate(parts)[:, n:], axis=0)
         return Solution(
@@ -177,3 +176,8 @@ class Fit:
             share = (Q**2).sum(-1) + ((projected @ of_p) ** 2).sum(-1)
             own += share[: len(part)].reshape(-1, q).sum(0)
         return own
+
+
+def _triangle(rows: Array) -> Array:
+    """R of rows = QR."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))

@@ -19,6 +19,7 @@ from lyapnet.task.systems import ControlSystem
 
 MOST_ROWS = 200_000  # of a file
 LARGEST_FILE = 40_000_000  # bytes
+LARGEST = 1e30  # number, whose square is one too
 TIMES = ("t", "time")  # names of the column of times
 
 
@@ -120,13 +121,18 @@ def read_measurements(path: Path, system: ControlSystem) -> Measurements:
     names = [name for name in outputs if name in found]
     if missing or not names:
         absent = missing[0] if missing else f"one of {', '.join(outputs)}"
-        hint = did_you_mean(missing[0] if missing else next(iter(outputs)), columns, "name it in the first row.")
-        raise UsageError(f"Expected a column for {absent} in {str(path)!r}, got {', '.join(columns)}; {hint}"[:400])
+        hint = did_you_mean(missing[0] if missing else next(iter(outputs)), unread, "name it in the first row.")
+        raise UsageError(f"Expected a column for {absent} in {str(path)!r}, got {', '.join(columns)[:200]!r}; {hint}")
+    if large := [name for name, column in found.items() if np.abs(column).max() > LARGEST]:
+        raise UsageError(
+            f"Expected numbers below {LARGEST:g} for {large[0]} in {str(path)!r}, got larger; correct them."
+        )
     times = found["t"]
     if not (np.diff(times) > 0).all():
-        row = int(np.argmin(np.diff(times) > 0)) + 3
+        row = int(np.argmin(np.diff(times) > 0)) + 1
         raise UsageError(
-            f"Expected rising times in {str(path)!r}, got {times[row - 2]:g} s in row {row}; sort the rows."
+            f"Expected rising times in {str(path)!r}, got {times[row]:g} s after {times[row - 1]:g} s in row {row + 2}"
+            "; sort the rows."
         )
     u = np.stack([found[name] for name in controls], -1) if controls else np.empty((len(times), 0))
     y = np.stack([found[name] for name in names], -1)

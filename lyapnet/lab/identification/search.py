@@ -30,7 +30,7 @@ LEAST_NOISE = 1e-9  # of readings, relative to their size
 ACCURATE, MOST_SUBSTEPS = 0.05, 64  # largest error of integration, in standard deviations of readings
 EXACT = 1e-6  # of data without noise: what counts as such a standard deviation, relative to the size of readings
 SMOOTHED = 7  # samples over which the rate of a reading is averaged for a first guess
-NOT_FINITE = "start from better values in system.parameters, or correct names and units of columns"
+START_BETTER = "start from better values in system.parameters, or correct names and units of columns"
 
 Array = np.ndarray
 
@@ -64,8 +64,7 @@ class Search:
             settled = self._settle(fit, start)
             if settled is None and found is None:
                 raise LyapnetError(
-                    "Expected trajectories of the model that follow the data, got some that are not finite; "
-                    f"{NOT_FINITE}."
+                    f"Expected trajectories of the model that follow the data, got others; {START_BETTER}."
                 )
             if settled is None:  # trajectories so long cannot be joined
                 break
@@ -96,8 +95,7 @@ class Search:
                 return Fit(shooting, sigma, self.bounds, self.unknown.before), count * SEGMENT, start
             count //= 2
         raise LyapnetError(
-            f"Expected data that the config's model can follow for {SEGMENT} samples, got trajectories that are not "
-            f"finite; {NOT_FINITE}."
+            f"Expected data that the config's model can follow for {SEGMENT} samples, got others; {START_BETTER}."
         )
 
     def start(self, shooting: Shooting, p: Array) -> Point:

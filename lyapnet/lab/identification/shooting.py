@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from lyapnet.lab.identification.measurements import Measurements, NamedReadings
 from lyapnet.task.family import with_attributes
@@ -29,10 +28,10 @@ from lyapnet.task.systems import ControlSystem
 SEGMENT = 20  # samples of a segment; so many steps follow one another, all else is done at once
 JOINED = 1e-9  # largest gap between two segments, relative to the largest value of each state
 MOST_JOINS = 15  # Newton steps, after which segments count as not to be joined
+LARGEST = 1e60  # number along a trajectory that is followed, and of its derivatives
 MOST_ROWS = 100_000  # of one batch of derivatives, which bounds the memory
 
 Array = np.ndarray
-Function = Callable[[ControlSystem, Tensor], Tensor]  # (system, x) ↦ y
 
 
 class Model:
@@ -53,41 +52,41 @@ class Model:
         return with_attributes(self.system, dict(zip(self.names, p, strict=True)))
 
     @torch.no_grad()
-    def values(self, function: Function, x: Tensor, p: Tensor) -> Tensor:
-        """y of a function at states (rows, n)."""
-        return function(self.member(p.unbind()), x)
+    def values(self, function: Callable[..., Tensor], x: Tensor, p: Tensor, *others: Tensor) -> Tensor:
+        """y of (system, x, *others) ↦ y, at states (rows, n)."""
+        return function(self.member(p.unbind()), x, *others)
 
-    @torch.no_grad()
-    def derivatives(self, function: Function, x: Tensor, p: Tensor) -> Tensor:
-        """∂y/∂(x, p) (rows, outputs, n + k) of a function that treats each row by itself, at states (rows, n).
+    @torch.enable_grad()
+    def derivatives(self, function: Callable[..., Tensor], x: Tensor, p: Tensor, *others: Tensor) -> Tensor:
+        """∂y/∂(x, p) (rows, outputs, n + k) of (system, x, *others) ↦ y, at states (rows, n).
 
-        In forward mode, as a parameter is one number for all rows, whose derivative is that of each row.
+        The function sees one row at a time, by vmap: to it a parameter is a number, and is that of the row alone. All
+        is copied once for each output, so that one backward pass computes all rows of the Jacobian.
+
+        Args:
+            others: further arguments of the function, (rows, …).
         """
-        columns = list[Tensor]()
-        with forward_ad.dual_level():
-            copies = x.expand(self.n, *x.shape).clone()
-            directions = torch.eye(self.n).to(x)[:, None].expand_as(copies).clone()
-            y = function(self.member(p.unbind()), forward_ad.make_dual(copies, directions))
-            columns += [*_tangent(y)]
-        for i in range(self.k):
-            with forward_ad.dual_level():
-                dual = [
-                    forward_ad.make_dual(each.clone(), torch.ones_like(each)) if i == j else each
-                    for j, each in enumerate(p.unbind())
-                ]
-                columns.append(_tangent(function(self.member(dual), x)))
-        return torch.stack(columns, -1)
 
+        def of_row(x: Tensor, p: Tensor, *others: Tensor) -> Tensor:
+            return function(self.member(p.unbind()), x, *others)
 
-def _tangent(y: Tensor) -> Tensor:
-    found = forward_ad.unpack_dual(y).tangent
-    return torch.zeros_like(y) if found is None else found.clone()
+        outputs = torch.func.vmap(of_row)(x[:1], p[None], *(each[:1] for each in others)).shape[-1]
+        copies = [
+            each.detach().expand(outputs, *each.shape).flatten(0, 1).clone()
+            for each in (x, p.expand(len(x), -1), *others)
+        ]
+        sought = [each.requires_grad_() for each in copies[:2]]
+        y = torch.func.vmap(of_row)(*copies)
+        if not y.requires_grad:
+            return x.new_zeros(len(x), outputs, self.n + self.k)
+        rows = torch.eye(outputs).to(y).repeat_interleave(len(x), 0)
+        found = torch.autograd.grad(y, sought, rows, materialize_grads=True)
+        return torch.cat(found, -1).reshape(outputs, len(x), -1).movedim(0, 1)
 
 
 def rk4(system: ControlSystem, x: Tensor, u: Tensor, h: Tensor) -> Tensor:
     """x after times h under controls u that are held, one step each."""
     tableau, slopes = TABLEAUX["rk4"], list[Tensor]()
-    u = u.expand(*x.shape[:-1], -1)
     for row in tableau.a:
         stage = x + h * weighted_sum(row, slopes) if any(row) else x
         slopes.append(system.dynamics(stage, u))
@@ -136,6 +135,7 @@ class Shooting:
         self._sampled = np.concatenate(own)  # which steps of all segments begin at a sample
         self.y = np.concatenate([piece.y for piece in self.pieces])
 
+    @np.errstate(over="ignore", invalid="ignore")
     def __call__(self, p: Float[Array, " k"], x0: Float[Array, "pieces n"], nodes: Array) -> Path | None:
         """The trajectories from x₀; None if they are not finite, or segments cannot be joined.
 
@@ -147,15 +147,14 @@ class Shooting:
         for _ in range(MOST_JOINS):
             x, sensitivities = self._integrate(nodes, p)
             ends, slopes = x[-1], sensitivities[-1]
-            if not (np.isfinite(ends).all() and np.isfinite(slopes).all()):
+            if not (_are_numbers(ends) and _are_numbers(slopes)):
                 return None
             phi, gamma = slopes[..., : self.n], slopes[..., self.n :]
             missing = np.zeros_like(nodes)
             missing[:-1] = ends[:-1] - nodes[1:]
-            with np.errstate(over="ignore", invalid="ignore"):
-                step = self._follow(phi, missing[..., None], np.zeros((len(x0), self.n, 1)))[..., 0]
+            step = self._follow(phi, missing[..., None], np.zeros((len(x0), self.n, 1)))[..., 0]
             gap = np.abs(step).max(0) / np.maximum(np.abs(x).max((0, 1)), 1e-12)
-            if not np.isfinite(step).all():
+            if not _are_numbers(step):
                 return None
             if gap.max() <= JOINED:
                 return self._path(nodes, p, x, sensitivities, phi, gamma)
@@ -191,15 +190,14 @@ class Shooting:
         path = self._states(nodes, parameters)
         before, u, h = (each.flatten(0, 1) for each in (path[:-1], self._steps.u, self._steps.h))
         parts = [
-            self.model.derivatives(lambda system, x, u=u, h=h: rk4(system, x, u, h), x, parameters)
+            self.model.derivatives(rk4, x, parameters, u, h)
             for x, u, h in zip(*(each.split(MOST_ROWS // n) for each in (before, u, h)), strict=True)
         ]
         A = torch.cat(parts).reshape(len(path) - 1, len(nodes), n, n + k).numpy()
         of_x = [np.broadcast_to(np.eye(n, n + k), A.shape[1:])]
-        with np.errstate(over="ignore", invalid="ignore"):
-            for each in A:
-                of_x.append(each[..., :n] @ of_x[-1])
-                of_x[-1][..., n:] += each[..., n:]
+        for each in A:
+            of_x.append(each[..., :n] @ of_x[-1])
+            of_x[-1][..., n:] += each[..., n:]
         return path.numpy(), np.stack(of_x)
 
     @torch.no_grad()
@@ -220,6 +218,11 @@ class Shooting:
         """Readings where segments end, (segments, q)."""
         parameters = torch.from_numpy(p)
         return self.model.values(self.model.readings.of, self._states(nodes, parameters)[-1], parameters).numpy()
+
+
+def _are_numbers(values: Array) -> bool:
+    """Whether values are finite, and so small that their squares are."""
+    return bool(np.abs(values).max() < LARGEST)
 
 
 def _padded(rows: Array, mode: Literal["constant", "edge"]) -> Array:

@@ -10,6 +10,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "rad": ("rad", 1.0), "deg": ("rad", math.pi / 180), "°": ("rad", math.pi / 180), "rev": ("rad", 2 * math.pi),
     "rad/s": ("rad/s", 1.0), "deg/s": ("rad/s", math.pi / 180), "°/s": ("rad/s", math.pi / 180),
     "rev/s": ("rad/s", 2 * math.pi), "rpm": ("rad/s", math.pi / 30),
+    "rad/s²": ("rad/s²", 1.0), "deg/s²": ("rad/s²", math.pi / 180), "m/s²": ("m/s²", 1.0), "N·m·s": ("N·m·s", 1.0),
     "m": ("m", 1.0), "km": ("m", 1e3), "cm": ("m", 1e-2), "mm": ("m", 1e-3), "µm": ("m", 1e-6),
     "m/s": ("m/s", 1.0), "cm/s": ("m/s", 1e-2), "mm/s": ("m/s", 1e-3), "km/h": ("m/s", 1 / 3.6),
     "s": ("s", 1.0), "ms": ("s", 1e-3), "µs": ("s", 1e-6), "min": ("s", 60.0), "h": ("s", 3600.0),
@@ -24,6 +25,7 @@ SPELLINGS = {
     "Nm": "N·m", "N m": "N·m", "N*m": "N·m", "mNm": "mN·m", "mN*m": "mN·m", "degree": "deg", "degrees": "deg",
     "degrees/s": "deg/s", "l": "L", "l/s": "L/s", "ml/s": "mL/s", "l/min": "L/min", "m3": "m³", "m^3": "m³",
     "m3/s": "m³/s", "m^3/s": "m³/s", "m3/h": "m³/h", "m^3/h": "m³/h", "us": "µs", "um": "µm", "sec": "s",
+    "m/s2": "m/s²", "m/s^2": "m/s²",
 }  # fmt: skip
 _WITH_UNIT = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]")
 

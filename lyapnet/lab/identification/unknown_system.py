@@ -95,22 +95,23 @@ class UnknownSystem:
         slight = torch.zeros_like(p)
         slight[i] = SLIGHT * (abs(float(p[i])) or 1.0) * (-1 if p[i] < 0 else 1)
 
-        def rates_and_readings(system: ControlSystem, x: Tensor) -> Tensor:
-            return torch.cat([system.dynamics(x, u.expand(*x.shape[:-1], -1)), self.readings.of(system, x)], -1)
+        def rates_and_readings(system: ControlSystem, x: Tensor, u: Tensor) -> Tensor:
+            return torch.cat([system.dynamics(x, u), self.readings.of(system, x)], -1)
 
         try:
-            here, there = (self.model.values(rates_and_readings, x, each) for each in (p, p + slight))
-            slope = self.model.derivatives(rates_and_readings, x, p)[..., self.system.n + i]
-            before = self.model.values(rates_and_readings, x, p - slight * STEP)
-            after = self.model.values(rates_and_readings, x, p + slight * STEP)
+            here, there, before, after = (
+                self.model.values(rates_and_readings, x, p + way, u)
+                for way in (0 * slight, slight, -slight * STEP, slight * STEP)
+            )
+            slope = self.model.derivatives(rates_and_readings, x, p, u)[..., self.system.n + i]
         except Exception as error:  # the system may be the user's
             raise UsageError(
                 f"Expected {cls} with f and g of torch operations that take {name} as a tensor, got "
-                f"{one_line(error)[:200]}; write them so, or leave {name} out of --parameters."
+                f"{one_line(error)[:200]}; write torch.stack in the place of torch.tensor and x.new_tensor."
             ) from error
         built = self._built({name: float((p + slight)[i])})
         if built is not None:
-            expected = rates_and_readings(built, x).detach()
+            expected = rates_and_readings(built, x, u).detach()
             if not torch.allclose(there, expected, 1e-9, 1e-9 * float(expected.abs().max())):
                 raise UsageError(
                     f"Expected {cls} to read {name} as self.{name}, got another f or g than that of {cls} built with "

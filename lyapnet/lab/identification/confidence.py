@@ -25,12 +25,18 @@ class Confidence(NamedTuple):
     directions: list[dict[str, float]]  # relative changes by name that are not told
 
 
-def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[str]) -> Confidence:
+def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[str], lags: int = 0) -> Confidence:
     """The covariance (MᵀM)⁻¹ of the parameters at a minimum, in the directions that readings tell.
+
+    Where residuals are correlated it is (MᵀM)⁻¹ S (MᵀM)⁻¹, with the covariance S of the gradient in p by its samples.
 
     In units of what each parameter does by itself, ‖∂ŷ/∂p_i‖, a direction in which effects cancel has a small singular
     value s, and 1/s is its standard deviation. It is not told if s is 0 up to rounding, nor if effects cancel to ALIKE
     and a standard deviation changes some parameter by all of its value.
+
+    Args:
+        before: the parameters at the start.
+        lags: samples over which residuals are correlated; 0: they are white.
     """
     p = found.point.p
     scale = np.where(p != 0, np.abs(p), np.abs(before))
@@ -45,4 +51,20 @@ def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[s
         change = change / change[np.argmax(np.abs(change))]
         directions.append({name: float(c) for name, c in zip(names, change, strict=True) if abs(c) > NAMED})
     root = V[known] / size / s[known, None]
-    return Confidence(root.T @ root, (V[~known] ** 2).sum(0) < PART**2, directions)
+    covariance = root.T @ root
+    if lags:
+        covariance = covariance @ _covariance_of_gradient(found.scores, lags) @ covariance
+    return Confidence(covariance, (V[~known] ** 2).sum(0) < PART**2, directions)
+
+
+def _covariance_of_gradient(scores: Sequence[Float[Array, "_ k"]], lags: int) -> Float[Array, "k k"]:
+    """Σ_l (1 − |l|/(L + 1)) Σ_t g_t g_{t+l}ᵀ over lags up to L, semidefinite by its weights.
+
+    Source: Newey, West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
+    matrix", Econometrica 1987.
+    """
+    total = sum(g.T @ g for g in scores)
+    for lag in range(1, lags + 1):
+        product = sum(g[:-lag].T @ g[lag:] for g in scores)
+        total = total + (1 - lag / (lags + 1)) * (product + product.T)
+    return np.asarray(total)

@@ -7,7 +7,7 @@ factor of their Jacobian alone, n + k + 1 rows in the place of thousands.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,10 +39,19 @@ class Solution:
     point: Point
     path: Path
     residuals: Float[Array, "samples q"]  # (ŷ − y) in the unit of each reading
-    leverage: Float[Array, " q"]  # how many unknowns the readings of each kind determine, together p and all x₀
+    leverage: Float[Array, " q"]  # sum of the diagonal entries of the hat matrix that belong to each kind of readings
     root: Float[Array, "rows k"]  # M with the information MᵀM on p, whatever x₀
+    scores: Sequence[Float[Array, "_ k"]]  # of each piece, what each sample adds to the gradient in p, whatever x₀
     size: Float[Array, " k"]  # ‖∂ŷ/∂p_i‖ in units of the noise, with x₀ known
     evaluations: int
+
+
+class _Evaluation(NamedTuple):
+    """Trajectories at some unknowns, with residuals and their Jacobian; None where there are none."""
+
+    w: Array
+    path: Path | None
+    rows: tuple[Array, Array] | None
 
 
 class Fit:
@@ -64,53 +73,60 @@ class Fit:
     ):
         self.shooting, self.sigma, self.bounds, self.anchor = shooting, sigma, bounds, anchor
         self.k = 0 if anchor is None else shooting.k
-        self._last: tuple[Array, Path | None, Any] | None = None
-        self._near: Point | None = None  # the last point with a path, and ∂ξ/∂(x₀, p) there
-        self._slope: Array | None = None
+        self._start: Point | None = None
+        self._last: _Evaluation | None = None
+        self._accepted: _Evaluation | None = None  # the last one whose derivatives were asked for
 
     def minimise(self, start: Point) -> Solution | None:
         """The minimum from a start; None if there are no trajectories from it."""
         from scipy.optimize import least_squares  # imported here because it takes 0.25 s
 
-        self._near, self._slope, self._last, self._p = start, None, None, start.p
-        w = np.concatenate([start.p[: self.k], start.x0.ravel()])
-        if self._at(w)[0] is None:
-            return None
         free = np.full(start.x0.size, np.inf)
         lower, upper = (
             np.concatenate([side[: self.k], sign * free]) for side, sign in zip(self.bounds, (-1, 1), strict=True)
         )
+        self._start, self._last, self._accepted = start, None, None
+        w = np.clip(np.concatenate([start.p[: self.k], start.x0.ravel()]), lower, upper)
+        if self._at(w).path is None:
+            return None
+        self._accepted = self._at(w)
         found = least_squares(
-            self._residuals, np.clip(w, lower, upper), self._jacobian, (lower, upper), x_scale="jac",  # pyright: ignore
+            self._residuals, w, self._jacobian, (lower, upper), x_scale="jac",  # pyright: ignore[reportArgumentType]
             ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=MOST_EVALUATIONS,
         )  # fmt: skip
-        path = self._at(found.x)[0]
-        assert path is not None
-        return self._solution(found.x, path, int(found.nfev))
+        path = self._at(found.x).path
+        return None if path is None else self._solution(found.x, path, int(found.nfev))
 
     def _split(self, w: Array) -> tuple[Array, Array]:
         """(p, x₀) of the unknowns."""
-        p = w[: self.k] if self.k else self._p
+        assert self._start is not None
+        p = w[: self.k] if self.k else self._start.p
         return p, w[self.k :].reshape(-1, self.shooting.n)
 
-    def _at(self, w: Array) -> tuple[Path | None, Any]:
-        """The path at some unknowns, and the rows of all readings."""
-        if self._last is not None and np.array_equal(self._last[0], w):
-            return self._last[1:]
-        p, x0 = self._split(w)
-        near, nodes = self._near, None
-        assert near is not None
-        if self._slope is not None:  # the segments begin where they did, moved to first order
-            step = np.concatenate([x0 - near.x0, np.broadcast_to(p - near.p, (len(x0), self.shooting.k))], -1)
-            moved = np.repeat(step, self.shooting.counts, 0)
-            nodes = near.nodes + (self._slope @ moved[..., None])[..., 0]
-        path = self.shooting(p, x0, near.nodes if nodes is None else nodes)
-        rows = None
-        if path is not None:
-            self._near, self._slope = Point(p, x0, path.nodes), path.of_nodes
-            rows = self._rows(p, path)
-        self._last = (w.copy(), path, rows)
-        return path, rows
+    def _at(self, w: Array) -> "_Evaluation":
+        """What there is at some unknowns; segments begin where they did last, moved to first order."""
+        for known in (self._last, self._accepted):
+            if known is not None and np.array_equal(known.w, w):
+                return known
+        assert self._start is not None
+        (p, x0), path, tried = self._split(w), None, [self._start.nodes]
+        if self._accepted is not None and self._accepted.path is not None:
+            near = self._accepted.path
+            step = np.concatenate(self._change(w - self._accepted.w), -1)
+            way = near.of_nodes @ np.repeat(step, self.shooting.counts, 0)[..., None]
+            tried = [near.nodes + way[..., 0], near.nodes]
+        for nodes in tried:
+            if (path := self.shooting(p, x0, nodes)) is not None:
+                break
+        rows = None if path is None else self._rows(p, path)
+        self._last = _Evaluation(w.copy(), path, rows)
+        return self._last
+
+    def _change(self, w: Array) -> tuple[Array, Array]:
+        """(Δx₀, Δp) of a change of the unknowns, for each piece."""
+        pieces = len(self.shooting.pieces)
+        p = w[: self.k] if self.k else np.zeros(self.shooting.k)
+        return w[self.k :].reshape(pieces, -1), np.tile(p, (pieces, 1))
 
     def _weighted(self, path: Path) -> tuple[Array, Array]:
         """(ŷ − y)/σ and its derivatives by (x₀, p), (samples, q) and (samples, q, n + k)."""
@@ -141,41 +157,41 @@ class Fit:
         return [part.reshape(-1, part.shape[-1]) for part in np.split(rows, ends)]
 
     def _residuals(self, w: Array) -> Array:
-        path, rows = self._at(w)
-        if path is None:
+        rows = self._at(w).rows
+        if rows is None:
             return np.full(len(self.shooting.pieces) * (self.shooting.n + self.k + 1) + self.k, np.inf)
         return rows[0]
 
     def _jacobian(self, w: Array) -> Array:
-        return self._at(w)[1][1]
+        """The derivatives, which are asked for where a step was taken."""
+        self._accepted = self._at(w)
+        assert self._accepted.rows is not None
+        return self._accepted.rows[1]
 
     def _solution(self, w: Array, path: Path, evaluations: int) -> Solution:
-        n, k, (p, x0) = self.shooting.n, self.k, self._split(w)
+        n, k, q, (p, x0) = self.shooting.n, self.k, len(self.sigma), self._split(w)
         r, J = self._weighted(path)
-        parts, roots = self._by_piece(J[..., : n + k]), list[Array]()
-        faint = FAINT / np.maximum(np.abs(path.nodes).max(0), 1e-12)
+        parts, left = self._by_piece(J[..., : n + k]), self._by_piece(r[..., None])
+        faint = np.diag(FAINT / np.maximum(np.abs(path.nodes).max(0), 1e-12))
+        bases, alone = list[Array](), list[Array]()
         for part in parts:  # with x₀ known a little, so that directions that readings do not tell take nothing away
-            whole = np.concatenate([part, np.eye(n, n + k) * faint[:, None]])
-            roots.append(_triangle(whole)[n:, n:])
-        root = np.concatenate(roots)
-        size = np.linalg.norm(np.concatenate(parts)[:, n:], axis=0)
+            Q = np.linalg.qr(np.concatenate([part[:, :n], faint]))[0]
+            of_p = np.concatenate([part[:, n:], np.zeros((n, k))])
+            bases.append(Q[: len(part)])
+            alone.append((of_p - Q @ (Q.T @ of_p))[: len(part)])
+        root = np.concatenate([_triangle(each) for each in alone])
+        inverse = np.linalg.pinv(root, rcond=1e-9)  # (MᵀM)⁻¹ is its product with its transpose
+        hat = [(Q**2).sum(-1) + ((of_p @ inverse) ** 2).sum(-1) for Q, of_p in zip(bases, alone, strict=True)]
         return Solution(
-            Point(p, x0, path.nodes), path, r * self.sigma, self._leverage(parts, root, faint), root, size, evaluations
+            point=Point(p, x0, path.nodes),
+            path=path,
+            residuals=r * self.sigma,
+            leverage=np.concatenate(hat).reshape(-1, q).sum(0),
+            root=root,
+            scores=[(of_p * e).reshape(len(e) // q, q, k).sum(1) for of_p, e in zip(alone, left, strict=True)],
+            size=np.linalg.norm(np.concatenate(parts)[:, n:], axis=0),
+            evaluations=evaluations,
         )
-
-    def _leverage(self, parts: Sequence[Array], root: Array, faint: Array) -> Array:
-        """The sum of the diagonal entries of the hat matrix that belong to each reading."""
-        n, k, q = self.shooting.n, self.k, len(self.sigma)
-        own = np.zeros(q)
-        of_p = np.linalg.pinv(root, rcond=1e-9)  # (root)⁺, so that of_p of_pᵀ is the covariance of p
-        for part in parts:
-            whole = np.concatenate([part[:, :n], np.diag(faint)])
-            Q = np.linalg.qr(whole)[0]
-            projected = np.concatenate([part[:, n:], np.zeros((n, k))])
-            projected = projected - Q @ (Q.T @ projected)
-            share = (Q**2).sum(-1) + ((projected @ of_p) ** 2).sum(-1)
-            own += share[: len(part)].reshape(-1, q).sum(0)
-        return own
 
 
 def _triangle(rows: Array) -> Array:

@@ -22,6 +22,7 @@ from lyapnet.task.systems import ControlSystem
 from lyapnet.training.stage_messages import StageReport, silent
 
 HELD_OUT = 0.25  # share of each recording, its end, that is not fitted
+LAGS_COUNTED = 4  # lags of residuals that intervals count with, in times after which they are no longer correlated
 AT = 1e-6  # distance from an end of the values that a system takes, relative to a parameter, that counts as there
 
 Array = np.ndarray
@@ -85,7 +86,6 @@ def _require_alike(recordings: Sequence[Measurements]) -> None:
 def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measurements]) -> Identification:
     """What a minimum says."""
     sigma, names, recordings = search.noise(found), search.readings.names, search.recordings
-    confidence = confidence_of(found, search.unknown.before, search.unknown.names)
     freedom = int(found.residuals.size - np.round(found.leverage.sum()))
     fitted, later = _curves(fit, found, held_out=False), _held_out(search, fit, found, tested)
     residuals = np.split(found.residuals, np.cumsum([len(each) for each in recordings])[:-1])
@@ -99,6 +99,8 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
         )
         for j, name in enumerate(names)
     ]
+    lags = LAGS_COUNTED * max((test.correlated + 1 for test in tests if not test.explained), default=0)
+    confidence = confidence_of(found, search.unknown.before, search.unknown.names, lags)
     return Identification(
         parameters=_estimates(search, found, confidence, freedom),
         covariance=confidence.covariance,

@@ -73,11 +73,12 @@ def sentences(found: Identification) -> list[str]:
             told.append(f"{name} is at the end of what the system takes; its interval is rough.")
         elif one.told and one.high - one.low > 2 * WIDE * abs(one.value):
             told.append(f"hardly told: {name}; a motion in which it counts for more would tell it.")
-    dynamic = [test.reading for test in found.tests if not _explains(test)]
+    dynamic = [test.reading for test in found.tests if not test.explained]
     if dynamic:
         told.append(
-            f"the model does not explain {', '.join(dynamic)}: a right one leaves noise alone. Intervals are too "
-            "narrow; free further parameters, or add what is missing (friction, a delay, a sensor's lag)."
+            f"the model does not explain {', '.join(dynamic)}: a right one leaves noise alone. Intervals count with "
+            "what is left, as if it were coloured noise; free further parameters, or add what is missing (friction, a "
+            "delay, a sensor's lag)."
         )
     elif wrong := [test for test in found.tests if not test.passed]:
         listed = ", ".join(f"{found.noise[test.reading] * (test.ratio or 1):.3g} of {test.reading}" for test in wrong)
@@ -85,10 +86,6 @@ def sentences(found: Identification) -> list[str]:
     if found.pieces > 1:
         told.append(f"fitted in {found.pieces} pieces, each from a state of its own.")
     return told
-
-
-def _explains(test: ResidualTest) -> bool:
-    return test.white >= LEVEL and (test.controls is None or test.controls >= LEVEL)
 
 
 def _in_percent(direction: Mapping[str, float]) -> dict[str, float]:
@@ -167,7 +164,7 @@ def identified_yaml(
     content.setdefault("system", {})["parameters"] = {**config.system.parameters, **values}
     others = {name: ends for name, ends in config.family.items() if name not in found.parameters}
     refused = _refusal(config, values, ranges, key, others)
-    note = f"{key}: not written, as {refused}" if refused else ""
+    note = f"{key}: not written: {refused}" if refused else ""
     if not refused:
         content.pop("randomise", None)
         content[key] = {**ranges, **(others if key == "family" else {})}
@@ -178,14 +175,22 @@ def identified_yaml(
         f"lyapnet train --config {out}",
         f"Identified from {', '.join(files)}: the values below, and 95 % intervals of each parameter by itself.",
         f"outputs: {{measure: [{', '.join(found.noise)}], noise: [{noise}]}}",
-        *([] if found.model_is_right else ["The model does not explain these data: intervals are too narrow."]),
-        *([f"{key}: {ranges}  # {refused}"] if refused and ranges else []),
+        *(
+            []
+            if found.model_is_right
+            else ["The model does not explain these data: intervals count what is left as coloured noise."]
+        ),
+        *([f"{key}: {_in_a_line(ranges)}"] if refused and ranges else []),
     ]
     config_from_plain(content)  # raises what would be refused later
     text = "".join(f"# {' '.join(line.split())}\n" for line in comments) + yaml.safe_dump(
         content, default_flow_style=None, sort_keys=False, allow_unicode=True, width=WIDTH
     )
     return text, note
+
+
+def _in_a_line(content: Any) -> str:
+    return yaml.safe_dump(content, default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf)
 
 
 def _refusal(

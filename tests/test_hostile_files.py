@@ -216,7 +216,7 @@ MEASUREMENTS = {  # a file ↦ what is said of it
     "no text": ("\udce9", "a CSV file of text"),
     "41 million rows": ("t,torque,angle\n" + "\n" * 41_000_000, "more than 4e+07"),
     "too many rows": ("t,torque,angle\n" + "0,0,0\n" * 200_001, "200002 rows and more"),
-    "three rows": ("t,torque,angle\n0,0,0\n1,0,0\n2,0,0\n", "more readings than twice"),
+    "three rows": ("t,torque,angle\n0,0,0\n1,0,0\n2,0,0\n", "Expected 8 samples or more in each file"),
     "no time": (f"a,torque,angle\n{STEADY}", "a column for t in"),
     "no control": (
         f"t,torq,angle\n{STEADY}",

@@ -20,6 +20,7 @@ from lyapnet.task.systems import states_that_are_rates
 from lyapnet.training.stage_messages import StageReport
 
 FIRST_PIECES, SHORTEST = 40, 40  # pieces of the first fit at most, and samples of each at least
+FEWEST = 8  # samples of a recording
 LONGER = 4  # times as long are the pieces of each further fit
 # A piece ends where an error of its initial state has grown by so much: readings beyond would tell parameters to more
 # digits than any plant has, as nothing is said here of what disturbs it on the way.
@@ -49,10 +50,12 @@ class Search:
         self.model, self.readings = unknown.model, unknown.readings
         self.bounds, self.known = unknown.bounds(), self._known_noise()
         k, n, total = len(unknown.names), unknown.system.n, sum(len(each) for each in recordings)
-        if total * self.readings.count < 2 * (k + n * len(recordings)):
+        shortest = min(len(each) for each in recordings)
+        if shortest < FEWEST or total * self.readings.count < 2 * (k + n * len(recordings)):
             raise UsageError(
-                f"Expected more readings than twice the {k} parameters and {n} states of each file, got "
-                f"{total * self.readings.count}; give longer files, or a smaller share that is held out."
+                f"Expected {FEWEST} samples or more in each file, and readings for {k} parameters and {n} states at the "
+                f"start of each file, got {shortest} samples and {total * self.readings.count} readings; give longer "
+                "files, or a smaller share that is held out."
             )
 
     def run(self) -> tuple[Fit, Solution]:

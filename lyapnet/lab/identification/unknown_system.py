@@ -19,6 +19,7 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
 
 SLIGHT = 0.01  # relative change of a parameter at which the system is compared with one that is built with it
+ASIDE = 0.1  # how far from a state that X₀ fixes that is done, relative to it, or of its unit
 STEP = 1e-2  # step of the differences that its derivative is compared with, in such changes
 
 Array = np.ndarray
@@ -91,6 +92,8 @@ class UnknownSystem:
         cls, name, p = type(self.system).__name__, self.names[i], torch.from_numpy(self.before)
         generator = torch.Generator().manual_seed(0)
         x = self.box.sample(TRIED, generator).double()
+        beside = ASIDE * x.abs().where(x != 0, 1.0) * torch.rand(x.shape, generator=generator, dtype=torch.float64)
+        x = torch.where(self.box.widths > 0, x, x + beside)  # where X₀ fixes a state, what multiplies it may not count
         u = torch.rand(TRIED, self.system.m, generator=generator, dtype=torch.float64)
         slight = torch.zeros_like(p)
         slight[i] = SLIGHT * (abs(float(p[i])) or 1.0) * (-1 if p[i] < 0 else 1)

@@ -1,6 +1,8 @@
 """How often true parameters are in the 95 % regions of `lyapnet identify`: three plants, 60 s of noisy data each.
 
-python -m tests.lab.identification.coverage [REPETITIONS] [PLANT …]
+python -m tests.lab.identification.coverage [REPETITIONS [COLOUR [PLANT …]]]
+
+COLOUR is the correlation of the noise from sample to sample, 0 for white noise.
 """
 
 import sys
@@ -13,19 +15,19 @@ from lyapnet.lab.identification import Identification, identify
 from tests.lab.identification.plants import PLANTS, record
 
 
-def repeated(name: str, repetitions: int) -> list[Identification]:
+def repeated(name: str, repetitions: int, colour: float = 0.0) -> list[Identification]:
     """What is identified of a plant, each time from other controls and other noise."""
     plant = PLANTS[name]
-    recordings = record(plant, range(repetitions))
+    recordings = record(plant, range(repetitions), colour=colour)
     return [identify(plant.settings(), [recording]) for recording in recordings]
 
 
-def main(repetitions: int, names: list[str]) -> None:
+def main(repetitions: int, colour: float, names: list[str]) -> None:
     """Print the table of docs/identify.md."""
     print("| plant | true p in the 95 % region | in each 95 % interval | half of it | told a wrong model |")
     print("|---|---|---|---|---|")
     for name in names:
-        began, found, true = time.monotonic(), repeated(name, repetitions), PLANTS[name].true
+        began, found, true = time.monotonic(), repeated(name, repetitions, colour), PLANTS[name].true
         inside = sum(each.contains(true) for each in found)
         own, half = [], []
         for parameter, value in true.items():
@@ -43,4 +45,5 @@ def main(repetitions: int, names: list[str]) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    main(int(sys.argv[1]) if sys.argv[1:] else 100, sys.argv[2:] or [*PLANTS])
+    given = sys.argv[1:]
+    main(int(given[0]) if given else 100, float(given[1]) if given[1:] else 0.0, given[2:] or [*PLANTS])

@@ -112,18 +112,20 @@ def simulate(system: ControlSystem, x0: Sequence[float], t: np.ndarray, u: np.nd
 def record(
     plant: Plant,
     seeds: Sequence[int] = (0,),
-    noise: float = 1.0,
+    size: float = 1.0,
     system: ControlSystem | None = None,
     seconds: float | None = None,
     measured: Sequence[str] | None = None,
+    colour: float = 0.0,
 ) -> list[Measurements]:
     """Noisy measurements of a plant, a recording for each seed.
 
     Args:
-        noise: how many times as large as usual.
+        size: of the noise, relative to what the plant says.
         system: another one that makes the data.
         seconds: how long; None: as the plant says.
         measured: the states; None: as the plant says.
+        colour: correlation of the noise from sample to sample.
     """
     generators = [np.random.default_rng(seed) for seed in seeds]
     t = np.arange(0.0, seconds or plant.seconds, plant.dt)
@@ -132,9 +134,12 @@ def record(
     names = list(plant.measured if measured is None else measured)
     sigma = dict(zip(plant.measured, plant.sigma, strict=True))
     y = simulate(system, plant.x0, t, u)[..., [list(system.state_names).index(name) for name in names]]
-    deviation = noise * np.array([sigma.get(name, 0.01) for name in names])
+    deviation = size * np.array([sigma.get(name, 0.01) for name in names])
     recordings = []
     for k, generator in enumerate(generators):
-        read = y[:, k] + deviation * generator.standard_normal(y[:, k].shape)
+        noise = generator.standard_normal(y[:, k].shape)
+        for i in range(1, len(noise)):
+            noise[i] = colour * noise[i - 1] + np.sqrt(1 - colour**2) * noise[i]
+        read = y[:, k] + deviation * noise
         recordings.append(Measurements("data.csv", t, u[:, k], read, tuple(names)))
     return recordings

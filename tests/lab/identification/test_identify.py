@@ -25,7 +25,7 @@ def found_of(name, seconds, config=None, parameters=(), held_out=0.0, settings=N
 
 @pytest.mark.parametrize("name", ["tanks", pytest.param("pendulum", marks=pytest.mark.gate), "cartpole"])
 def test_without_noise_parameters_are_found_to_a_millionth(name):
-    found = found_of(name, {"tanks": 20.0, "pendulum": 4.0, "cartpole": 1.6}[name], noise=0.0)
+    found = found_of(name, {"tanks": 20.0, "pendulum": 4.0, "cartpole": 1.6}[name], size=0.0)
     for parameter, value in PLANTS[name].true.items():
         assert found.values[parameter] == pytest.approx(value, rel=1e-6)
     assert not found.unknown_directions
@@ -47,6 +47,15 @@ def test_the_noise_is_found():
     found = found_of("tanks", 40.0)
     assert found.noise == pytest.approx({"upper level": 0.004, "lower level": 0.004}, rel=0.15)
     assert found.model_is_right
+
+
+def test_intervals_count_with_coloured_noise():
+    """Of one recording: the spread of estimates under noise that is as large and white is less than half as wide."""
+    white, coloured = (found_of("tanks", 40.0, colour=colour) for colour in (0.0, 0.95))
+    assert white.model_is_right
+    assert not coloured.model_is_right
+    ratio = np.sqrt(np.diag(coloured.covariance) / np.diag(white.covariance))
+    assert (ratio > 2).all()
 
 
 # What the data do not tell
@@ -175,6 +184,12 @@ def test_a_plant_that_falls_is_followed_in_pieces():
 # What is refused
 
 
+def test_parameters_count_where_initial_states_are_fixed():
+    """Friction of a cart-pole that begins at rest."""
+    fixed = {"initial_states": {"lower": [0, 3.1, 0, 0], "upper": [0, 3.2, 0, 0]}}
+    assert found_of("cartpole", 1.6, settings=fixed).parameters.keys() == PLANTS["cartpole"].true.keys()
+
+
 class Derived(ControlAffineSystem):
     """A parameter that f reads through another attribute."""
 
@@ -229,7 +244,7 @@ def test_data_that_no_trajectory_follows_are_refused():
 
 def test_an_estimate_ends_where_the_system_does():
     """A damping of zero is estimated as no less."""
-    found = found_of("pendulum", 4.0, system=Pendulum(1.0, 0.5, 0.0).double(), noise=3.0)
+    found = found_of("pendulum", 4.0, system=Pendulum(1.0, 0.5, 0.0).double(), size=3.0)
     damping = found.parameters["damping"]
     assert damping.low == 0.0 <= damping.value
     assert damping.value < 0.01

@@ -53,9 +53,9 @@ class Search:
         shortest = min(len(each) for each in recordings)
         if shortest < FEWEST or total * self.readings.count < 2 * (k + n * len(recordings)):
             raise UsageError(
-                f"Expected {FEWEST} samples or more in each file, and readings for {k} parameters and {n} states at the "
-                f"start of each file, got {shortest} samples and {total * self.readings.count} readings; give longer "
-                "files, or a smaller share that is held out."
+                f"Expected {FEWEST} samples or more in each file, and readings for {k} parameters and {n} states at "
+                f"the start of each file, got {shortest} samples and {total * self.readings.count} readings; give "
+                "longer files, or a smaller share that is held out."
             )
 
     def run(self) -> tuple[Fit, Solution]:

@@ -110,7 +110,8 @@ class UnknownSystem:
         except Exception as error:  # the system may be the user's
             raise UsageError(
                 f"Expected {cls} with f and g of torch operations that take {name} as a tensor, got "
-                f"{one_line(error)[:200]}; write torch.stack in the place of torch.tensor and x.new_tensor."
+                f"{one_line(error)[:200]}; write torch.stack in the place of torch.tensor and x.new_tensor, "
+                f"or leave {name} out of --parameters."
             ) from error
         built = self._built({name: float((p + slight)[i])})
         if built is not None:
@@ -118,7 +119,8 @@ class UnknownSystem:
             if not torch.allclose(there, expected, 1e-9, 1e-9 * float(expected.abs().max())):
                 raise UsageError(
                     f"Expected {cls} to read {name} as self.{name}, got another f or g than that of {cls} built with "
-                    f"{name}={float((p + slight)[i]):g}; derive in f and g what __init__ derives from it."
+                    f"{name}={float((p + slight)[i]):g}; derive in f and g what __init__ derives from it, or leave "
+                    f"{name} out of --parameters."
                 )
         if torch.equal(here, there):
             raise UsageError(

@@ -9,9 +9,11 @@ from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.lab.identification import Measurements, identify
 from lyapnet.lab.identification.report import as_json, sentences, verdict
-from lyapnet.task.systems import Pendulum
+from lyapnet.lab.identification.unknown_system import UnknownSystem
+from lyapnet.task.systems import SYSTEMS, Pendulum
 from tests.lab.identification.coverage import repeated
 from tests.lab.identification.plants import PLANTS, record, simulate
+from tests.task.test_family import READS
 
 
 def found_of(name, seconds, config=None, parameters=(), held_out=0.0, settings=None, **options):
@@ -226,6 +228,16 @@ def test_parameters_that_cannot_be_sought_are_refused(parameters, expected):
     t = np.arange(40.0)
     with pytest.raises(UsageError, match=expected):
         identify(config, [Measurements("a", t, t[:, None], t[:, None], ("x",))], parameters)
+
+
+@pytest.mark.parametrize("name", READS)
+def test_parameters_of_registered_systems_can_be_sought(name):
+    system = SYSTEMS[name]()
+    box = {"lower": [-0.3] * system.n, "upper": [0.3] * system.n}
+    config = config_from_plain(
+        {"experiment": "x", "system": {"name": name}, "initial_states": box, "horizon": {"steps": 1}}
+    )
+    assert UnknownSystem(config, READS[name], system.state_names[:1]).names == READS[name]
 
 
 def test_files_with_other_readings_are_refused():

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below
-from lyapnet.lab.identification.results import Curve, Identification
+from lyapnet.lab.identification.results import Curve, Identification, fit_of
 
 MOST_READINGS, MOST_RECORDINGS = 4, 3
 BAND = 2  # half-width of the band around zero, in standard deviations of a reading
@@ -32,7 +32,7 @@ def measured_and_fitted(found: Identification) -> Figure:
                 unit = f" ({found.units[reading]})" if found.units[reading] else ""
                 panels[2 * j, 0].set_ylabel(f"{reading}{unit}", fontsize=8)
                 panels[2 * j + 1, 0].set_ylabel("data − model", fontsize=7)
-        panels[0, column].set_title(_title(found, name), fontsize=8)
+        panels[0, column].set_title(_title(name, curves), fontsize=8)
         panels[-1, column].set_xlabel("time (s)", fontsize=8)
     handles = {str(each.get_label()): each for p in panels[0] for each in p.get_legend_handles_labels()[0]}
     legend_below(figure, [*handles.values()])  # pyright: ignore[reportArgumentType]
@@ -58,7 +58,10 @@ def _with_gaps(curve: Curve, values: np.ndarray) -> np.ndarray:
     return np.insert(values.astype(float), curve.starts[1:], np.nan)
 
 
-def _title(found: Identification, name: str) -> str:
-    shares = [f"{share:.1%}" for share in found.fit.values()]
-    later = [f"{share:.1%}" for share in found.fit_held_out.values()]
-    return f"{name.rpartition('/')[2]}: fit {', '.join(shares)}" + (f"; held out {', '.join(later)}" if later else "")
+def _title(name: str, curves: Sequence[Curve]) -> str:
+    """The name of a recording, and how well each of its parts is fitted."""
+    parts = list[str]()
+    for curve in curves:
+        shares = ", ".join(f"{share:.1%}" for share in fit_of([curve]))
+        parts.append(f"{'held out' if curve.held_out else 'fit'} {shares}")
+    return f"{name.rpartition('/')[2]}: {'; '.join(parts)}"

@@ -13,8 +13,8 @@ from lyapnet.experiment.config import Config
 from lyapnet.lab.identification.confidence import Confidence, confidence_of
 from lyapnet.lab.identification.estimation import Fit, Solution
 from lyapnet.lab.identification.measurements import Measurements, read_measurements
-from lyapnet.lab.identification.residuals import test_of
-from lyapnet.lab.identification.results import CONFIDENCE, Curve, Estimate, Identification
+from lyapnet.lab.identification.residuals import examine
+from lyapnet.lab.identification.results import CONFIDENCE, Curve, Estimate, Identification, fit_of
 from lyapnet.lab.identification.search import Search
 from lyapnet.lab.identification.shooting import SEGMENT
 from lyapnet.lab.identification.unknown_system import UnknownSystem, system_of
@@ -90,7 +90,7 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
     fitted, later = _curves(fit, found, held_out=False), _held_out(search, fit, found, tested)
     residuals = np.split(found.residuals, np.cumsum([len(each) for each in recordings])[:-1])
     tests = [
-        test_of(
+        examine(
             name,
             [each[:, j] for each in residuals],
             [each.u for each in recordings],
@@ -106,8 +106,8 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
         covariance=confidence.covariance,
         unknown_directions=confidence.directions,
         noise=dict(zip(names, sigma.tolist(), strict=True)),
-        fit=dict(zip(names, _fit_of(fitted), strict=True)),
-        fit_held_out=dict(zip(names, _fit_of(later), strict=True)) if later else {},
+        fit=dict(zip(names, fit_of(fitted), strict=True)),
+        fit_held_out=dict(zip(names, fit_of(later), strict=True)) if later else {},
         tests=tests,
         curves=[*fitted, *later],
         units=dict(zip(names, search.readings.units, strict=True)),
@@ -165,10 +165,3 @@ def _curves(fit: Fit, found: Solution, held_out: bool) -> list[Curve]:
         else:
             curves.append(Curve(piece.name, piece.t, piece.y, own, held_out, np.zeros(1, int)))
     return curves
-
-
-def _fit_of(curves: Sequence[Curve]) -> list[float]:
-    """1 − ‖y − ŷ‖/‖y − ȳ‖ of each reading over some curves."""
-    y, y_hat = (np.concatenate([getattr(curve, name) for curve in curves]) for name in ("y", "y_hat"))
-    spread = np.linalg.norm(y - y.mean(0), axis=0)
-    return (1 - np.linalg.norm(y - y_hat, axis=0) / np.where(spread > 0, spread, 1.0)).tolist()

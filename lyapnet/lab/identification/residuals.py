@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-LAGS = 25  # of correlations, in samples
+LAGS = 25  # of tests, in samples
+MOST_LAGS = 1000  # over which residuals are correlated, as far as that is counted
 LEVEL = 1e-3  # below this probability a right model is given up
 
 Array = np.ndarray
@@ -49,7 +50,7 @@ class ResidualTest:
         return self.explained and (self.size is None or self.size >= LEVEL)
 
 
-def test_of(
+def examine(
     reading: str,
     residuals: Sequence[Float[Array, " N"]],
     controls: Sequence[Float[Array, "N m"]],
@@ -66,12 +67,13 @@ def test_of(
     """
     from scipy.stats import chi2  # imported here because it takes 0.3 s
 
-    lags = max(1, min(LAGS, min(map(len, residuals)) // 4))
+    longest = max(1, min(MOST_LAGS, min(map(len, residuals)) // 4))
+    lags = min(LAGS, longest)
     total, square = sum(map(len, residuals)), sum(float(e @ e) for e in residuals)
     if square == 0:
         return ResidualTest(reading, 1.0, None, None, None, 0)
-    rho = np.array([sum(float(e[k:] @ e[:-k]) for e in residuals) for k in range(1, lags + 1)]) / square
-    portmanteau = total * (total + 2) * float((rho**2 / (total - np.arange(1, lags + 1))).sum())
+    rho = np.array([sum(float(e[k:] @ e[:-k]) for e in residuals) for k in range(1, longest + 1)]) / square
+    portmanteau = total * (total + 2) * float((rho[:lags] ** 2 / (total - np.arange(1, lags + 1))).sum())
     within = np.abs(rho) < 3 / np.sqrt(total)
     size = ratio = None
     if noise is not None:
@@ -84,12 +86,12 @@ def test_of(
         _independence(residuals, controls, lags),
         size,
         ratio,
-        int(np.argmax(within)) if within.any() else lags,
+        int(np.argmax(within)) if within.any() else longest,
     )
 
 
 def _independence(residuals: Sequence[Array], controls: Sequence[Array], lags: int) -> float | None:
-    """The probability of so good a regression of residuals on the controls of the samples before; see test_of."""
+    """The probability of so good a regression of residuals on the controls of the samples before; see examine."""
     from scipy.stats import chi2
 
     earlier, later = list[Array](), list[Array]()

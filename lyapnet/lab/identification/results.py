@@ -1,7 +1,7 @@
 """What measurements tell of the parameters of a system."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -39,6 +39,13 @@ class Curve(NamedTuple):
     y_hat: Array
     held_out: bool
     starts: Array  # indices at which the model begins anew from a state of its own
+
+
+def fit_of(curves: Sequence[Curve]) -> list[float]:
+    """1 − ‖y − ŷ‖/‖y − ȳ‖ of each reading over some curves."""
+    y, y_hat = (np.concatenate([getattr(curve, name) for curve in curves]) for name in ("y", "y_hat"))
+    spread = np.linalg.norm(y - y.mean(0), axis=0)
+    return (1 - np.linalg.norm(y - y_hat, axis=0) / np.where(spread > 0, spread, 1.0)).tolist()
 
 
 @dataclass(frozen=True)

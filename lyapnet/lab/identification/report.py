@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
+from rich.box import SIMPLE
 from rich.table import Table
 
 from lyapnet.base.errors import UsageError, one_line
@@ -25,7 +26,7 @@ WIDE = 0.5  # half of an interval relative to the value, beyond which the data h
 
 def parameter_table(found: Identification, title: str) -> Table:
     """A row for each parameter."""
-    table = Table("parameter", "in the config", "estimate", "95 % interval", "±", title=title)
+    table = Table("parameter", "in the config", "estimate", "95 % interval", "±", title=title, box=SIMPLE)
     for name, one in found.parameters.items():
         table.add_row(name, f"{one.before:.{DIGITS}g}", f"{one.value:.{DIGITS}g}", _interval(one), _half(one))
     return table
@@ -33,7 +34,7 @@ def parameter_table(found: Identification, title: str) -> Table:
 
 def reading_table(found: Identification) -> Table:
     """A row for each reading."""
-    table = Table("reading", "noise σ", "fit", "held out", "residuals")
+    table = Table("reading", "noise σ", "fit", "held out", "residuals", box=SIMPLE)
     for test in found.tests:
         name = test.reading
         unit = f" ({found.units[name]})" if found.units[name] else ""
@@ -76,9 +77,9 @@ def sentences(found: Identification) -> list[str]:
     dynamic = [test.reading for test in found.tests if not test.explained]
     if dynamic:
         told.append(
-            f"the model does not explain {', '.join(dynamic)}: a right one leaves noise alone. Intervals count with "
-            "what is left, as if it were coloured noise; free further parameters, or add what is missing (friction, a "
-            "delay, a sensor's lag)."
+            f"the model does not explain {', '.join(dynamic)}: a right one leaves noise alone. Intervals count what is "
+            "left as coloured noise, and may still be too narrow; free further parameters, or add what is missing "
+            "(friction, a delay, a sensor's lag)."
         )
     elif wrong := [test for test in found.tests if not test.passed]:
         listed = ", ".join(f"{found.noise[test.reading] * (test.ratio or 1):.3g} of {test.reading}" for test in wrong)

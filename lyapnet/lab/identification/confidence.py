@@ -41,12 +41,14 @@ def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[s
     p = found.point.p
     scale = np.where(p != 0, np.abs(p), np.abs(before))
     counts = np.where(scale > 0, found.size * scale > NO_EFFECT, found.size > 0)
-    size = np.where(counts, found.size, 1.0)
-    _, s, V = np.linalg.svd(np.where(counts, found.root, 0.0) / size, full_matrices=False)
+    size, some = np.where(counts, found.size, 1.0), np.flatnonzero(counts)
+    _, s, V_of_some = np.linalg.svd((found.root / size)[:, some], full_matrices=False)
+    V = np.zeros((len(s), len(p)))
+    V[:, some] = V_of_some
     relative = V / size / np.where(scale > 0, scale, 1 / size)
     far = np.abs(relative).max(1) > s
-    known = (s > NOT_AT_ALL * s[0]) & ~((s < ALIKE) & far)
-    directions = list[dict[str, float]]()
+    known = (s > NOT_AT_ALL * s.max(initial=0.0)) & ~((s < ALIKE) & far)
+    directions = [{name: 1.0} for name, does in zip(names, counts, strict=True) if not does]
     for change in relative[~known]:
         change = change / change[np.argmax(np.abs(change))]
         directions.append({name: float(c) for name, c in zip(names, change, strict=True) if abs(c) > NAMED})
@@ -54,7 +56,7 @@ def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[s
     covariance = root.T @ root
     if lags:
         covariance = covariance @ _covariance_of_gradient(found.scores, lags) @ covariance
-    return Confidence(covariance, (V[~known] ** 2).sum(0) < PART**2, directions)
+    return Confidence(covariance, counts & ((V[~known] ** 2).sum(0) < PART**2), directions)
 
 
 def _covariance_of_gradient(scores: Sequence[Float[Array, "_ k"]], lags: int) -> Float[Array, "k k"]:

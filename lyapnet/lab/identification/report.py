@@ -84,15 +84,16 @@ def sentences(found: Identification) -> list[str]:
     elif wrong := [test for test in found.tests if not test.passed]:
         listed = ", ".join(f"{found.noise[test.reading] * (test.ratio or 1):.3g} of {test.reading}" for test in wrong)
         told.append(f"the noise is another one than outputs.noise says: {listed}; correct it.")
-    if found.pieces > 1:
+    if found.pieces > sum(not curve.held_out for curve in found.curves):
         told.append(f"fitted in {found.pieces} pieces, each from a state of its own.")
     return told
 
 
 def _in_percent(direction: Mapping[str, float]) -> dict[str, float]:
-    """A direction with a smallest change of one percent."""
-    least = min(abs(change) for change in direction.values())
-    return {name: 0.01 * change / least for name, change in direction.items()}
+    """A direction with a smallest change of one percent, and no change above ten."""
+    sizes = [abs(change) for change in direction.values()]
+    scale = min(0.01 / min(sizes), 0.1 / max(sizes))
+    return {name: scale * change for name, change in direction.items()}
 
 
 def _probability(p: float) -> str:

@@ -101,6 +101,8 @@ def test_a_parameter_that_has_no_effect_on_the_data_is_named(swinging):
     assert found.values["length"] == pytest.approx(0.5, rel=0.01)
     assert "not told: mass has no effect on these data; leave it out of --parameters." in sentences(found)
     assert as_json(found, [])["parameters"]["mass"]["low"] is None
+    both = identify(settings, [swinging], ["length", "mass", "gravity"]).unknown_directions
+    assert both == [{"mass": 1.0}, pytest.approx({"length": 1.0, "gravity": 1.0}, rel=1e-3)]
 
 
 def test_a_parameter_that_the_data_hardly_tell_is_named():

@@ -65,8 +65,8 @@ def _covariance_of_gradient(scores: Sequence[Float[Array, "_ k"]], lags: int) ->
     Source: Newey, West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
     matrix", Econometrica 1987.
     """
-    total = sum(g.T @ g for g in scores)
+    total = np.sum([g.T @ g for g in scores], 0)
     for lag in range(1, lags + 1):
-        product = sum(g[:-lag].T @ g[lag:] for g in scores)
+        product = np.sum([g[:-lag].T @ g[lag:] for g in scores], 0)
         total = total + (1 - lag / (lags + 1)) * (product + product.T)
-    return np.asarray(total)
+    return total

@@ -32,6 +32,7 @@ from lyapnet.claims.two_sided import TwoSidedCertificate, labels_of_both
 from lyapnet.controller.controller import Controller
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
+from lyapnet.prover.float_errors import FloatLaw
 from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress
 from lyapnet.prover.readings import Readings, readings_from
@@ -42,7 +43,9 @@ NOT_PROVED = "a leaf is not proved"
 Report = Callable[[Progress], None] | None
 
 
-def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
+def check(
+    controller: Controller, path: Path, workers: int = 1, report: Report = None, law: FloatLaw | None = None
+) -> dict[str, Any]:
     """Check whether a file proves its claim; return the object that `lyapnet certify check --json` prints.
 
     The parameters of the claim (α, δ, D, w; λ, B, Y, c; λ, a, the probability; G, σ, ε) are read from the file, and the
@@ -50,14 +53,23 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
     D, the bounds of the condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The
     verdict is certified or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is
     certified up to the ρ of the file, and the result has the share of X₀ in it.
+
+    Args:
+        law: the program that computes u, where the claim is about one; its errors are bounded again, and a claim that
+            its file states has to be this one.
     """
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
         kind, reprove = kind_of(path)
         if kind not in (NoisyCertificate.kind, ReachCertificate.kind):
             require_no_noise(controller.problem, kind)
-        found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report)
+        if law is not None and reprove not in (_reprove_funnel, _reprove_two_sides):
+            raise UsageError(f"Expected no --file for a {kind} certificate, got one; leave it out.")
+        with_law = {} if law is None else {"law": law}
+        found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report, **with_law)
         numbers, reason = found.numbers, found.reason
+        if law is not None and law.claimed not in ("", claim_text(found.numbers)):
+            reason = "the header states another claim than this proof"
         share = found.seconds / found.searched if found.searched > 0 else None
     except UsageError as error:
         reason = str(error)
@@ -87,7 +99,8 @@ class Checked(NamedTuple):
     searched: float  # seconds of the original search, as recorded in the file
 
 
-Reprove = Callable[[Controller, Path, Budget, Report], Checked]
+Reprove = Callable[..., Checked]
+"""(controller, file, budget, report[, law]) ↦ what is proved again."""
 
 
 def kind_of(path: Path) -> tuple[str, Reprove]:
@@ -153,17 +166,35 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
     return kept
 
 
-def _reprove_funnel(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+def _reprove_funnel(
+    controller: Controller, path: Path, budget: Budget, report: Report, law: FloatLaw | None = None
+) -> Checked:
     kept = kept_funnel(controller, path)
     claim = prove_funnel(
         controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
-        path, True, kept.degree, kept.disturbance, kept.readings,
+        path, True, kept.degree, kept.disturbance, kept.readings, law,
     )  # fmt: skip
     reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or the funnel misses some of X₀"
-    return Checked(SoundCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, kept.seconds)
+    return Checked(_stated(SoundCertificate(controller, claim, {})), reason, claim.proof_seconds, kept.seconds)
 
 
-def _reprove_two_sides(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+def _stated(certificate: SoundCertificate) -> dict[str, Any]:
+    """What is proved again, with the claim in words and formulas."""
+    claim = {"words": certificate.in_words(), "formula": certificate.in_formulas()}
+    return {**certificate.proved(), "claim": claim}
+
+
+def claim_text(result: Mapping[str, Any]) -> str:
+    """The claim of a checked funnel in one line."""
+    lower, upper = result["set"]
+    D = " × ".join(f"[{low!r}, {high!r}]" for low, high in zip(lower, upper, strict=True))
+    stated = f"{result['claim']['words']} {'; '.join(result['claim']['formula'])}. D = {D}, "
+    return " ".join(f"{stated}fingerprint {result['fingerprint']}.".split())
+
+
+def _reprove_two_sides(
+    controller: Controller, path: Path, budget: Budget, report: Report, law: FloatLaw | None = None
+) -> Checked:
     above, below = (_kept_side(controller, path, name) for name in ("above", "below"))
     if (above.alpha, above.delta) != (below.alpha, below.delta) or above.disturbance is not None:
         raise UsageError(
@@ -173,15 +204,15 @@ def _reprove_two_sides(controller: Controller, path: Path, budget: Budget, repor
     loop, problem, numbers = controller.closed_loop, controller.problem, (above.alpha, above.delta)
     upper = prove_funnel(
         loop, problem, *numbers, above.states, budget, _generator(), report, path, True, above.degree,
-        readings=above.readings,
+        readings=above.readings, law=law,
     )  # fmt: skip
     lower = prove_lower_bound(loop, problem, *numbers, below.states, budget, _generator(), report, path, True)
-    certificate = TwoSidedCertificate(
-        SoundCertificate(controller, upper, {}), LowerBoundCertificate(controller, lower, {}), {}
-    )  # fmt: skip
+    bound = SoundCertificate(controller, upper, {})
+    certificate = TwoSidedCertificate(bound, LowerBoundCertificate(controller, lower, {}), {})
     reason = None if certificate.verdict == "certified" else f"{NOT_PROVED}, or one side misses some of X₀"
     seconds = upper.proof_seconds + lower.proof_seconds
-    return Checked(certificate.proved(), reason, seconds, above.seconds + below.seconds)
+    numbers = {**certificate.proved(), "claim": _stated(bound)["claim"]}
+    return Checked(numbers, reason, seconds, above.seconds + below.seconds)
 
 
 def _reprove_region(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:

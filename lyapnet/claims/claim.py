@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -279,6 +280,8 @@ def _plain(name: str, value: Any) -> Any:
         return [f"{name}={_format_numbers(entry)}" for name, entry in value.items()] or None
     if value is None or isinstance(value, bool | int | float | str):
         return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
     if name in BOXES:
         return _format_box(value)
     return [_format_box(each) for each in value] or None if name in LISTS_OF_BOXES else repr(value)

@@ -12,6 +12,7 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import Interrupted, UsageError, signals_taken
 from lyapnet.base.types import Corner, Corners, PerState, Points, State, Value
+from lyapnet.claims.computed_laws import computed_by
 from lyapnet.claims.control_sets import check_controls, check_minimum
 from lyapnet.claims.crossing import Violation, beginning_level, crossing_level, find_violation
 from lyapnet.claims.ignorable_states import ignorable_states
@@ -33,6 +34,7 @@ from lyapnet.prover.condition import (
     require_own_gradient,
 )
 from lyapnet.prover.counterexamples import Counterexample, find_counterexample
+from lyapnet.prover.float_errors import FloatLaw
 from lyapnet.prover.proof import Progress, Proof, prove, tell
 from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
@@ -146,6 +148,7 @@ def prove_funnel(
     degree: int = 2,
     disturbance: State | None = None,
     readings: Readings | None = None,
+    law: FloatLaw | None = None,
 ) -> ProvedFunnel:
     """Prove the largest funnel that a budget allows, up to the one that contains X₀.
 
@@ -156,9 +159,10 @@ def prove_funnel(
         report, keep, replay, degree: as in prove.
         disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
         readings: when u is read; None: at every t.
+        law: a program that computes u in floating-point numbers, whose errors count; None: u is exact.
 
     Raises:
-        UsageError: α, δ or D are unsuitable; or the closed loop has an operator without a bound.
+        UsageError: α, δ or D are unsuitable; readings are of another program; an operator has no bound.
         Interrupted: Ctrl-C or SIGTERM; the message says whether the proof was kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
@@ -171,6 +175,9 @@ def prove_funnel(
     left_out, initial_states, wanted, D, domain, sides, levels, assumed = find_setting(
         condition, problem, duration, states, budget, report
     )
+    if law is not None:
+        tell(report, budget, "errors of the C on D")
+    condition.readings = readings = computed_by(law, readings, D, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))

@@ -7,6 +7,7 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.claims.arguments import of_states
 from lyapnet.claims.claim import ReadAtTimes
 from lyapnet.controller.controller import Controller
+from lyapnet.prover.float_errors import ULPS
 from lyapnet.prover.readings import Readings
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlSystem
@@ -25,7 +26,8 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
             limits depend on the state.
     """
     problem, system = controller.problem, controller.system
-    given = [name for name in ("interval", "jitter", "delay", "measured", "quantised") if getattr(claim, name)]
+    names = ("interval", "jitter", "delay", "measured", "quantised", "file")
+    given = [name for name in names if getattr(claim, name, None)]
     refused = _reason_against(problem)
     time = claim.time or ("held" if given or (made_for == "held" and refused is None) else "continuous")
     if time == "continuous":
@@ -67,8 +69,17 @@ def readings_facts(readings: Readings | None, system: ControlSystem) -> dict[str
     return {
         "read_within": readings.interval, "used_within": readings.delay,
         "measured": _named(system.state_names, readings.errors),
-        "control_errors": _named(system.control_names, readings.control_errors),
+        "control_errors": _named(system.control_names, readings.control_errors), **_computed_facts(readings, system),
     }  # fmt: skip
+
+
+def _computed_facts(readings: Readings, system: ControlSystem) -> dict[str, Any]:
+    """The program that computes u; nothing for real numbers."""
+    computed = readings.computed
+    if computed is None:
+        return {}
+    named = dict(zip(system.control_names, computed.errors, strict=True))
+    return {"computed_by": computed.sha256, "precision": computed.precision, "computed_within": named}
 
 
 READINGS = {
@@ -76,6 +87,9 @@ READINGS = {
     "used_within": "seconds from a reading to its use, at most",
     "measured": "errors of the states that are read, at most",
     "control_errors": "errors of the controls, at most",
+    "computed_by": "SHA-256 of the C that computes u",
+    "precision": "its numbers",
+    "computed_within": "how far its u is off, at most",
 }
 """Labels of `readings_facts`."""
 
@@ -94,6 +108,22 @@ def readings_text(readings: Readings | None, system: ControlSystem) -> str:
         for name, value in named.items()
     )  # fmt: skip
     return f"with u read at any times at most {readings.interval!r} s apart{delay}, and held until the next{errors}"
+
+
+def computed_text(readings: Readings | None, system: ControlSystem) -> str:
+    """That a file computes u, as a sentence; empty for real numbers."""
+    computed = None if readings is None else readings.computed
+    if computed is None:
+        return ""
+    off = " and ".join(
+        f"{error!r} of {name}" for name, error in zip(system.control_names, computed.errors, strict=True)
+    )
+    return (
+        f"u is what policy.h and policy.c of SHA-256 {computed.sha256} (without the comments at their top) compute in "
+        f"{computed.precision} from the measured state, called up to t = {computed.latest!r} s: that is at most {off} "
+        "off, and counted among the errors, given arithmetic of IEEE 754 without -ffast-math, and functions of the C "
+        f"library within {ULPS} units in the last place. "
+    )
 
 
 def control_of(readings: Readings, law: str) -> str:

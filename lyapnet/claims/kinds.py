@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # as in claim.py
     from lyapnet.claims.certificates import Certificate
     from lyapnet.claims.from_below import LowerBoundCertificate
     from lyapnet.controller.controller import Controller
+    from lyapnet.prover.float_errors import FloatLaw
     from lyapnet.task.sets import Box
 
 
@@ -111,6 +112,9 @@ class Funnel(ReadAtTimes):
     delta: float | None = option(None, SLACK, at_least=0, remedy=RATE)
     states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
     disturbance: Mapping[str, float] | None = option(None, DISTURBANCE, metavar="STATE=W", check=check_disturbance)
+    file: "FloatLaw | None" = option(
+        None, "The folder of an export in C: the claim is about its u, in its numbers.", metavar="FOLDER"
+    )  # fmt: skip
 
     def require_law(self, controller: "Controller") -> None:
         from lyapnet.claims.control_sets import require_known_minimum
@@ -124,14 +128,20 @@ class Funnel(ReadAtTimes):
         from lyapnet.claims.least_cost import DEGREE
         from lyapnet.claims.preconditions import require_goal
         from lyapnet.claims.sound_certificate import SoundCertificate
+        from lyapnet.prover.float_errors import FloatLaw
 
         require_goal(controller.problem, self.kind)
+        if not isinstance(self.file, FloatLaw | None):
+            raise UsageError(
+                f"Expected file as the law that it computes, got {self.file!r}; take "
+                "lyapnet.exchange.export.CertifiedFiles(controller, folder).law()."
+            )
         made_for = "held" if getattr(controller.closed_loop.policy, "held", False) else "continuous"
         found = prove_funnel(
             controller.closed_loop, controller.problem, self.alpha, slack_of(self.delta, controller),
             box_of(self.states), run.budget, run.generator, run.report, run.keep, degree=DEGREE if run.two_sided else 2,
             disturbance=disturbance_of(self.disturbance, controller),
-            readings=readings_of(self, controller, made_for),
+            readings=readings_of(self, controller, made_for), law=self.file,
         )  # fmt: skip
         return SoundCertificate(controller, found, run.options(self))
 

@@ -18,7 +18,7 @@ from lyapnet.claims.certificates import (
 )
 from lyapnet.claims.costs import CostCertificate, Inside
 from lyapnet.claims.funnel import ProvedFunnel
-from lyapnet.claims.held_laws import READINGS, control_of, readings_facts, readings_text
+from lyapnet.claims.held_laws import READINGS, computed_text, control_of, readings_facts, readings_text
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.tables import floored
@@ -108,8 +108,9 @@ class SoundCertificate(CostCertificate):
             f"model {readings_text(claim.readings, self.controller.system)}: no closed loop that starts in it leaves "
             f"the funnel, or D,{self._or_violates} up to "
             f"T = {claim.duration:g} s, {self._under_disturbances}and its cost is bounded as below. It holds at least "
-            f"{floored(claim.volume_share)} of X₀ by volume. It is about the traced operations of f, g, ℓ, V and u, "
-            f"which have this fingerprint; {FROZEN}{self.parameters_text}"
+            f"{floored(claim.volume_share)} of X₀ by volume. "
+            f"{computed_text(claim.readings, self.controller.system)}It is about the traced operations of f, g, ℓ, V "
+            f"and u, which have this fingerprint; {FROZEN}{self.parameters_text}"
             f"{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 

@@ -25,6 +25,7 @@ from lyapnet.cli.claims import (
     TwoSided,
     Value,
     Workers,
+    law_of,
     note_written,
     pushes_of_one_state,
 )
@@ -147,6 +148,9 @@ def check(
     given: Given,
     value: Value = None,
     law: Law = None,
+    file: Annotated[
+        Path | None, typer.Option(help="The folder of the export in C that the proof is about.", metavar="FOLDER")
+    ] = None,
     workers: Workers = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     debug: Debug = False,
@@ -158,7 +162,8 @@ def check(
 
     given = given.with_functions(value, law)
     controller = given.load()
-    result = checked(controller, proof, workers, progress_reporter(given.report, "check"))
+    computed = None if file is None else law_of(controller, file, given)
+    result = checked(controller, proof, workers, progress_reporter(given.report, "check"), computed)
     given.report.rest()
     if as_json:
         print(json.dumps(result, allow_nan=False))
@@ -196,8 +201,10 @@ def _prove(given: Given, claims: Sequence[Claim], search: Search, refining: Refi
 
     def certified(checkpoint: Path, started: float | None = None) -> Any:
         started, found = started or time.monotonic(), given.of(checkpoint)
+        controller = found.load()
+        made = [_with_law(each, controller, found) for each in claims]
         certificate = certify(
-            found.load(), *claims, budget=search.budget(started), seed=output.seed, keep=refining.keep, report=progress
+            controller, *made, budget=search.budget(started), seed=output.seed, keep=refining.keep, report=progress
         )
         output.show(certificate, found)
         return certificate
@@ -211,6 +218,12 @@ def _prove(given: Given, claims: Sequence[Claim], search: Search, refining: Refi
         given.checkpoint, certified, refining.refine, refining.overrides or [], notes, given.parts()
     )
     return output.write(certificate, given.of(checkpoint))
+
+
+def _with_law(claim: Claim, controller: Any, given: Given) -> Claim:
+    """A claim with the law that its file computes, in the place of the file."""
+    file = getattr(claim, "file", None)
+    return claim if file is None else replace(claim, file=law_of(controller, file, given))  # pyright: ignore
 
 
 def _prove_for_each(

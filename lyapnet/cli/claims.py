@@ -112,6 +112,14 @@ class Output:
             note_written(path)
 
 
+def law_of(controller: Any, folder: Path, given: Given) -> Any:
+    """The law that an export in C computes, for claims about it; the export has to be that of the controller."""
+    from lyapnet.exchange.export.certified import CertifiedFiles
+
+    given.report("comparing the C with the checkpoint")
+    return CertifiedFiles(controller, folder, given.checkpoint).law()
+
+
 def note_written(path: Path) -> None:
     """Say on stderr that a file was written."""
     Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

@@ -1,7 +1,7 @@
 """lyapnet export."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -27,6 +27,12 @@ def export(
     ] = None,
     outputs: Measured = None,
     deviation: FirstDeviation = None,
+    certified: Annotated[
+        Path | None,
+        typer.Option(
+            help="To c: check this proof about the files, and write its claim into the header.", metavar="PROOF"
+        ),
+    ] = None,
     debug: Debug = False,
 ) -> None:
     """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
@@ -41,6 +47,9 @@ def export(
 
     if estimator is None and (outputs or deviation):
         raise UsageError("Expected --estimator with --outputs and --initial-deviation, got none; add --estimator ekf.")
+    if certified is not None and (to != "c" or estimator is not None):
+        got = f"--to {to}" if to != "c" else "--estimator"
+        raise UsageError(f"Expected --certified with --to c and the law alone, got {got}; leave one of them out.")
     controller = given.load() if beyond is None else given.load().continued(beyond)
     exported = controller
     if estimator is not None:
@@ -61,3 +70,24 @@ def export(
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)
+    if certified is not None:
+        notes.print(_write_claim(controller, out, certified, given), soft_wrap=True)
+
+
+def _write_claim(controller: Any, folder: Path, proof: Path, given: Given) -> str:
+    """Check a proof about exported files, and write its claim into their header; what was done, in words."""
+    from lyapnet.claims.checking import check, claim_text
+    from lyapnet.exchange.export.certified import CertifiedFiles
+
+    files = CertifiedFiles(controller, folder, given.checkpoint)
+    given.report("checking the proof")
+    result = check(controller, proof, law=files.law())
+    if result["verdict"] != "certified" or not result.get("computed_by"):
+        got = result["reason"] or "one about u in real numbers"
+        raise UsageError(
+            f"Expected a proof of these files for --certified, got: {got} The files are written without a claim; prove "
+            "one by lyapnet certify sound CKPT --keep PROOF --file FOLDER."
+        )
+    header = files.write_claim(claim_text(result))
+    given.report.rest()
+    return f"certified: {proof}, checked, is about these files; {header} states its claim"

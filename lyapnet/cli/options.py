@@ -290,7 +290,7 @@ READ: dict[str, tuple[bool, Callable[[Any], Any]]] = {
     "avoid": (True, lambda texts: [read_set(text, "avoid") for text in texts]), "disturbance": (True, read_pushes),
     "noise": (True, partial(read_pushes, option="--noise STATE=SIGMA")), "parameters": (True, read_intervals),
     "time": (False, str), "measured": (True, partial(read_pushes, option="--measured STATE=E")),
-    "quantised": (True, partial(read_pushes, option="--quantised CONTROL=STEP")),
+    "quantised": (True, partial(read_pushes, option="--quantised CONTROL=STEP")), "file": (False, Path),
 }  # fmt: skip
 """A field that is no number ↦ whether its option may be given again, and how its text is read."""
 

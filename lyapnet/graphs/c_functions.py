@@ -56,15 +56,15 @@ def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], res
     Raises:
         ExportError: an operator has no rule.
     """
-    graph = _remove_shape_sources(graph)
+    graph = without_shape_sources(graph)
     inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
     outputs = _Translator(graph, text).run(*inputs)
     for name, output in zip(results, outputs, strict=True):
         text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
 
 
-def _remove_shape_sources(graph: GraphModule) -> GraphModule:
-    """Remove operations of which only the shape is used, such as x.sin() in torch.zeros_like(x.sin())."""
+def without_shape_sources(graph: GraphModule) -> GraphModule:
+    """The trace without operations of which only the shape is used, such as x.sin() in torch.zeros_like(x.sin())."""
     nodes = copy.deepcopy(graph.graph)
     for node in list(nodes.nodes):
         if node.op == "call_function" and name_of(node.target) in SHAPED:

@@ -14,6 +14,22 @@ STEPS, RUNS = 2, 3  # of a simulation after a reading; simulations from each rea
 
 
 @dataclass(frozen=True)
+class Computed:
+    """That a program computes the law in floating-point numbers, and how far it is off (lyapnet.prover.float_errors).
+
+    Args:
+        sha256: of its file.
+        precision: float32 or float64.
+        errors: the largest |ũ_j − u_j| of each control, in its unit, (m,), for readings up to `latest`, in s.
+    """
+
+    sha256: str
+    precision: str
+    errors: Sequence[float]
+    latest: float
+
+
+@dataclass(frozen=True)
 class Readings:
     """When a law is read, and how far what is read and what is given may be off.
 
@@ -26,6 +42,7 @@ class Readings:
         errors: the largest |e_i| of each measured state, in its unit, (n,).
         control_errors: the largest |r_j| of each control, in its unit, (m,).
         duration: T in s; None for a law that is read as u(0, x), at every time and for ever.
+        computed: the program that computes the law, whose errors are among the control_errors; None: real numbers.
     """
 
     interval: float
@@ -33,6 +50,7 @@ class Readings:
     errors: Sequence[float]
     control_errors: Sequence[float]
     duration: float | None
+    computed: Computed | None = None
 
     @property
     def receding(self) -> bool:
@@ -42,7 +60,7 @@ class Readings:
     @property
     def facts(self) -> dict[str, Any]:
         """The numbers as plain data."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+        return asdict(self, dict_factory=_listed)
 
     @property
     def longest(self) -> float:
@@ -59,6 +77,12 @@ class Readings:
         return span if self.duration is None else torch.minimum(span, self.duration - t)
 
 
+def _listed(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Fields by name, with lists for tuples; without a program that there is not."""
+    given = ((name, value) for name, value in items if not (name == "computed" and value is None))
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in given}
+
+
 def readings_from(facts: Any, duration: float | None) -> Readings | None:
     """Readings from their `facts`, as a file of a proof has them; None for None, a law that is read at every t.
 
@@ -70,9 +94,13 @@ def readings_from(facts: Any, duration: float | None) -> Readings | None:
     """
     if facts is None:
         return None
+    of = facts.get("computed")
+    computed = of and Computed(
+        str(of["sha256"]), str(of["precision"]), tuple(map(float, of["errors"])), float(of["latest"])
+    )  # fmt: skip
     found = Readings(
         float(facts["interval"]), float(facts["delay"]), tuple(map(float, facts["errors"])),
-        tuple(map(float, facts["control_errors"])), duration,
+        tuple(map(float, facts["control_errors"])), duration, computed,
     )  # fmt: skip
     numbers = [found.interval, found.delay, *found.errors, *found.control_errors]
     if not found.interval > 0 or not all(0 <= number < math.inf for number in numbers):

@@ -1,13 +1,14 @@
 """Operator graphs rewritten for bounds: the same function, with tighter bounds."""
 
+import copy
 from operator import attrgetter
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.fx import Graph, Node
+from torch.fx import Graph, GraphModule, Node
 
-from lyapnet.graphs.tracing import without_repetitions
+from lyapnet.graphs.tracing import is_view, name_of, without_repetitions
 
 aten = torch.ops.aten
 
@@ -69,6 +70,40 @@ def _between(start: Node, end: Any) -> list[Node]:
         if node in above:
             above.update(node.all_input_nodes)
     return [node for node in nodes if node in below & above and node is not start]
+
+
+DECIDED = 2.0**-22
+"""Distance from a threshold, relative to the numbers that were added, beyond which float32 comes to the same truth."""
+
+
+def with_known_times(module: GraphModule, latest: float) -> GraphModule:
+    """The graph for 0 ≤ t ≤ latest, t its first argument: clamps that keep t are gone, and so are choices that its
+    truths about t decide. Programs in float32 or float64 keep t and choose likewise.
+
+    Followed are t plus numbers, which rise with t: what holds at both ends of its range holds between them.
+    """
+    graph, ends, truths = copy.deepcopy(module.graph), dict[Node, list[float]](), dict[Node, bool]()
+    sizes = dict[Node, float]()  # of the numbers that were added
+    for node in list(graph.nodes):
+        source, name = next(iter(node.args), None), name_of(node.target)
+        if node.op == "placeholder" and not ends:
+            ends[node], sizes[node] = [0.0, latest], latest
+        elif source in truths and is_view(node.target):
+            truths[node] = truths[source]
+        elif name == "where" and source in truths:
+            node.replace_all_uses_with(node.args[1 if truths[source] else 2])
+        elif source in ends and isinstance(node.args[-1], int | float) and not node.kwargs:
+            at = [float(node.target(torch.tensor(end, dtype=torch.float64), *node.args[1:])) for end in ends[source]]
+            room = DECIDED * (sizes[source] + abs(node.args[-1]))
+            if name in ("add", "sub"):
+                ends[node], sizes[node] = at, sizes[source] + abs(node.args[-1])
+            elif name == "clamp" and at == ends[source] == [0.0, latest] and not 0 < abs(node.args[-1] - latest) < room:
+                node.replace_all_uses_with(source)
+            elif name in ("ge", "gt", "le", "lt") and at[0] == at[1]:
+                near = any(abs(end - node.args[1]) <= room for end in ends[source])
+                truths.update({} if near else {node: bool(at[0])})
+    graph.eliminate_dead_code()
+    return GraphModule(module, graph)
 
 
 def _content(graph: Graph, node: Node) -> Any:

@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,13 @@ def file_comment(facts: Mapping[str, str]) -> str:
 
 
 def sources(
-    controller: Controller, law: Law, facts: Mapping[str, str], style: Style, tried: Points, loop: Any = None
+    controller: Controller,
+    law: Law,
+    facts: Mapping[str, str],
+    style: Style,
+    tried: Points,
+    loop: Any = None,
+    claim: str = "",
 ) -> dict[str, str]:
     """File name ↦ text.
 
@@ -101,6 +108,7 @@ def sources(
         style: names and precision.
         tried: what it is compared on, beyond which a return code says so.
         loop: the estimator around the law, as `LoopTraces`; None: the law alone.
+        claim: what is proved of the files, for the comment of the header.
 
     Raises:
         ExportError: an operation has no rule in C; or the law is too large for a stack.
@@ -123,8 +131,9 @@ def sources(
         "tables": f"{style.size * tables.count} bytes",
         "stack": f"{style.size * stack} bytes of arrays; a compiler's frames add to that",
     }
+    claimed = {"certified": textwrap.fill(claim, 114, subsequent_indent="   ")} if claim else {}
     return {
-        "policy.h": file_comment(sized) + style.code(_header(controller, law, style, loop)),
+        "policy.h": file_comment({**sized, **claimed}) + style.code(_header(controller, law, style, loop)),
         "policy.c": file_comment(sized) + style.code(code),
         "main.c": style.code(_example(law, style) if loop is None else loop.example(style)),
         "CMakeLists.txt": CMAKE.replace("@", "policy" if style.name == NAME else f"{style.name}_policy"),

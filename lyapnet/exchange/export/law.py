@@ -59,6 +59,10 @@ class Law:
         """(u, V)"""
         return self._traced(lambda t, x: (self._applied(t, x), self._continued.V.at_any_time(t, x)[0]))
 
+    def control_beside(self, policy: Callable[[Tensor, Tensor], Tensor]) -> GraphModule:
+        """(u, policy(t, x)), (m,) each, in one graph."""
+        return self._traced(lambda t, x: (self._applied(t, x), policy(t, x)[0]))
+
     def _applied(self, t: Tensor, x: Tensor) -> Tensor:
         """u (m,) of a batch of one state."""
         return self._controls.applied(x, self._continued.at_any_time(t, x))[0]

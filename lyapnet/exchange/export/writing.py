@@ -98,7 +98,7 @@ def export(
         draft = Path(folder)
         if to in IN_C:
             style = c.Style(name, DTYPES[dtype])
-            written = _Written(controller, law, facts, style, loop)
+            written = Written(controller, law, facts, style, loop)
             return _write_c(written, draft, path) if to == "c" else _write_fmu(written, draft, path, fmi)
         make, write, run = PROGRAMS[to]
         made, file = make(law), draft / path.name
@@ -118,10 +118,10 @@ def compiled(controller: Controller) -> c.CompiledLaw:
         ExportError: as export.
     """
     with tempfile.TemporaryDirectory() as place:
-        return _Written(controller, Law(controller), {}, c.Style(), None).verified(Path(place), c.FAST)[0]
+        return Written(controller, Law(controller), {}, c.Style(), None).verified(Path(place), c.FAST)[0]
 
 
-class _Written:
+class Written:
     """The C of a controller, and of a loop if there is one: text, and how far it is from the controller.
 
     Args:
@@ -138,10 +138,10 @@ class _Written:
         self.facts = facts if self.traces is None else {**facts, **self.traces.facts()}
         self.tried = points(controller)
 
-    def sources(self, **more: str) -> dict[str, str]:
-        """File name ↦ text, with further facts."""
+    def sources(self, claim: str = "", **more: str) -> dict[str, str]:
+        """File name ↦ text, with further facts, and a claim about the files in the header."""
         facts = {**self.facts, **more}
-        return c.sources(self.controller, self.law, facts, self.style, self.tried, self.traces)
+        return c.sources(self.controller, self.law, facts, self.style, self.tried, self.traces, claim)
 
     def verified(self, folder: Path, options: Sequence[str]) -> tuple[c.CompiledLaw, Agreement]:
         """The C written into a folder, compiled, and held against the controller."""
@@ -199,7 +199,7 @@ def _require_place(path: Path, to: str) -> None:
         raise UsageError(f"Expected a new folder, or that of an earlier export, got {str(path)!r}; choose another.")
 
 
-def _write_c(written: _Written, draft: Path, folder: Path) -> Exported:
+def _write_c(written: Written, draft: Path, folder: Path) -> Exported:
     """The files of a C library; in a folder that has them, those of the law alone."""
     _, agreement = written.verified(draft, c.FLAGS)
     folder.mkdir(exist_ok=True)
@@ -211,7 +211,7 @@ def _write_c(written: _Written, draft: Path, folder: Path) -> Exported:
     return Exported(paths, agreement)
 
 
-def _write_fmu(written: _Written, draft: Path, path: Path, version: str) -> Exported:
+def _write_fmu(written: Written, draft: Path, path: Path, version: str) -> Exported:
     """A unit for co-simulation."""
     _, agreement = written.verified(draft, c.FLAGS)
     variables = fmu.variables_of(written.controller, written.law, written.traces)

@@ -1,0 +1,55 @@
+"""Claims about a law that a program computes in floating-point numbers: its errors where it is read."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from lyapnet.base.errors import UsageError
+from lyapnet.prover.float_errors import FloatLaw
+from lyapnet.prover.readings import Readings
+from lyapnet.task.sets import Box
+
+
+def computed_by(
+    law: FloatLaw | None, readings: Readings | None, states: Box, left_out: Sequence[int]
+) -> Readings | None:
+    """Readings of a law that a program computes: its errors where D is measured are added to those of the controls.
+
+    Readings of a kept proof have them already; they are bounded again.
+
+    Args:
+        law: None for a law in real numbers.
+        states: D.
+        left_out: states that D does not bound.
+
+    Raises:
+        UsageError: the proof is about another file, or D does not bound a state; or as FloatLaw.errors.
+    """
+    kept = None if readings is None else readings.computed
+    if readings is None or (law is None and kept is None):
+        return readings
+    if law is None or (kept is not None and law.sha256 != kept.sha256):
+        assert kept is not None
+        got = "none" if law is None else law.sha256
+        raise UsageError(
+            f"Expected --file with the C of this proof, of SHA-256 {kept.sha256}, got {got}; name the folder of its "
+            "export."
+        )
+    if left_out:
+        raise UsageError(
+            "Expected a set D with bounds of each state that the C takes, got states that nothing depends on, along "
+            "which D has none; certify it without --file."
+        )
+    e = torch.tensor(readings.errors, dtype=torch.float64)
+    found = law.computed_on((states.lower - e, states.upper + e))
+    if kept is None:
+        more = tuple(a + b for a, b in zip(readings.control_errors, found.errors, strict=True))
+        return replace(readings, computed=found, control_errors=more)
+    within = all(a <= min(b, c) for a, b, c in zip(found.errors, kept.errors, readings.control_errors, strict=True))
+    if not within or found.precision != kept.precision or found.latest < kept.latest:
+        raise UsageError(
+            f"Expected errors of the C of at most {list(kept.errors)}, as in this proof, got {list(found.errors)}; "
+            "prove it again with --file."
+        )
+    return readings

@@ -264,7 +264,7 @@ def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False
     like = x if isinstance(x, TaylorForm) else values
     x, values = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, values))
     values = values.with_rounding(values.shape.numel())
-    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_put(indices, y, accumulate=True), x, values)
+    moved = _rearranged(lambda base, y: aten.index_put.default(torch.zeros_like(base), indices, y, True), x, values)
     return taylor.add(x, moved)
 
 

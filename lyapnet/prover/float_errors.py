@@ -50,6 +50,7 @@ aten = torch.ops.aten
 ULPS = 4
 """Units in the last place by which functions of the C library are assumed to err at most."""
 WIDER = 1 + 2.0**-10
+FOLDED = 4.0  # units of float64 by which a constant that torch computed may be off in the claim
 TOLERANCE = 0.2  # relative to the largest S, up to which boxes are cut
 START, BOXES = 4096, 200_000  # boxes from which a search begins, about, and that are bounded at most
 
@@ -156,17 +157,18 @@ class _Constant:
     """A value that does not depend on (t, x), and what a program makes of it."""
 
     value: Any
-    exact: bool = True  # whether the program has the same number
+    units: float = 0.0  # of rounding, by which the program's number may be off
     scales: bool = False  # whether a product with it is exact, a power of two
 
 
-def _constant(value: Any, numbers: Format) -> _Constant:
-    y = torch.as_tensor(value)
-    if not y.is_floating_point() and isinstance(value, Tensor):
+def _constant(value: Any, numbers: Format, computed: bool = False) -> _Constant:
+    """A constant; one that torch computed may be another in the claim, where it has other operators for the same."""
+    if not isinstance(value, Tensor | int | float):
         return _Constant(value)
-    y = y.double()
-    exact = numbers.name == "float64" or bool((y.float().double() == y).all())
-    return _Constant(value, exact, bool((y.frexp().mantissa.abs() == 0.5).all()))
+    y = torch.as_tensor(value).double()
+    folded = FOLDED * (computed and isinstance(value, Tensor) and value.is_floating_point())
+    units = folded if numbers.name == "float64" else 1.0 - bool((y.float().double() == y).all())
+    return _Constant(value, units, not units and bool((y.frexp().mantissa.abs() == 0.5).all()))
 
 
 def _constants(graph: GraphModule, numbers: Format) -> dict[Node, _Constant]:
@@ -178,7 +180,8 @@ def _constants(graph: GraphModule, numbers: Format) -> dict[Node, _Constant]:
         elif node.op == "call_function" and all(source in values for source in node.all_input_nodes):
             args, kwargs = (map_arg(each, values.__getitem__) for each in (node.args, node.kwargs))
             values[node] = node.target(*args, **kwargs)
-    return {node: _constant(value, numbers) for node, value in values.items()}
+    computed = {node for node in values if node.op == "call_function" and not is_view(node.target)}
+    return {node: _constant(value, numbers, node in computed) for node, value in values.items()}
 
 
 class _Program(Interpreter):
@@ -229,19 +232,19 @@ class _Program(Interpreter):
         return tree_map(lambda leaf: self._as_held(leaf) if isinstance(leaf, _Constant) else leaf, value)
 
     def _as_held(self, constant: _Constant) -> Any:
-        if constant.exact:
+        if not constant.units:
             return constant.value
-        return self.rounded(torch.as_tensor(constant.value, dtype=torch.float64))
+        return self.rounded(torch.as_tensor(constant.value, dtype=torch.float64), constant.units)
 
     def constant(self, value: Any) -> Any:
         """A number in an operation as a constant; other values as they are."""
         return _constant(value, self.numbers) if isinstance(value, int | float) else value
 
-    def gamma(self, roundings: int) -> float:
+    def gamma(self, roundings: float) -> float:
         """The largest relative error after so many roundings."""
         return roundings * self.numbers.unit / (1 - roundings * self.numbers.unit)
 
-    def mark(self, y: Tensor, roundings: int, error: float = 0.0) -> Tensor:
+    def mark(self, y: Tensor, roundings: float, error: float = 0.0) -> Tensor:
         """y for bounds, after so many roundings and with an error; it has none where it may overflow."""
         return mark_rounded(y, self._at, self.gamma(roundings), error, self.numbers.largest / 2)
 
@@ -292,11 +295,11 @@ def _product_of_two(program: _Program, target: Any, a: Any, b: Any, **options: A
     given = [each for each in (a, b) if isinstance(each, _Constant)]
     y = getattr(aten, name_of(target)).Tensor(*(each.value if isinstance(each, _Constant) else each for each in (a, b)))
     scales = any(each.scales for each in ([b] if name_of(target) == "div" else [a, b]) if isinstance(each, _Constant))
-    return program.rounded(y, 0.0 if scales else 1.0 + any(not each.exact for each in given))
+    return program.rounded(y, 0.0 if scales else 1.0 + sum(each.units for each in given))
 
 
 def _power(program: _Program, target: Any, x: Tensor, exponent: float) -> Tensor:
-    if not program.constant(exponent).exact:
+    if program.constant(exponent).units:
         raise UsageError(f"Expected exponents that {program.numbers.name} has, got {exponent}; write it with exp.")
     return program.rounded(target(x, exponent), {2: 1, 1: 0, 3: 2, -1: 1, 0.5: 1}.get(exponent, 2 * ULPS))
 
@@ -320,9 +323,9 @@ def _mean(program: _Program, target: Any, x: Tensor, dim: Any = None, keepdim: b
 
 def _matrix_product(program: _Program, target: Any, a: Any, b: Any) -> Tensor:
     """ab of matrices or vectors."""
-    exact = all(each.exact for each in (a, b) if isinstance(each, _Constant))
+    units = sum(each.units for each in (a, b) if isinstance(each, _Constant))
     left, right = (each.value.double() if isinstance(each, _Constant) else each for each in (a, b))
-    roundings, lost = left.shape[-1] + (not exact), program.numbers.least * left.shape[-1]
+    roundings, lost = left.shape[-1] + units, program.numbers.least * left.shape[-1]
     size = program.mark(target(left.detach().abs(), right.detach().abs()), 0)
     if isinstance(a, _Constant):  # errors of the summands are those of one factor
         y = target(left, program.mark(right, roundings))
@@ -331,9 +334,20 @@ def _matrix_product(program: _Program, target: Any, a: Any, b: Any) -> Tensor:
     return program.with_error(program.mark(y, 0, lost), program.gamma(roundings) * size + lost)
 
 
+def _index_put(program: _Program, target: Any, x: Any, indices: Any, values: Any, accumulate: bool = False) -> Tensor:
+    """x with other entries at some places, or with values that are added there one after another."""
+    x, indices, values = program.plain((x, indices, values))
+    if not accumulate:
+        return target(x, indices, values)
+    additions = max(len(each) for each in indices if each is not None)
+    size = program.mark(target(x.detach().abs(), indices, values.detach().abs(), True), 0)
+    y = target(program.mark(x, additions), indices, program.mark(values, additions), True)
+    return program.with_error(y, program.gamma(additions) * size)
+
+
 def _clamp(program: _Program, target: Any, x: Tensor, low: Any = None, high: Any = None) -> Tensor:
     limits = [program.constant(each) for each in (low, high)]
-    if all(each.exact for each in limits if isinstance(each, _Constant)):
+    if not any(each.units for each in limits if isinstance(each, _Constant)):
         return _exact(program, target, x, low, high)
     return aten.clamp.Tensor(
         x, *(torch.as_tensor(program.plain(each)) if each is not None else None for each in limits)
@@ -382,6 +396,7 @@ RULES: dict[str, Rule] = {
         _elementwise(2 * ULPS),
     ),
     "sigmoid": _elementwise(2 * ULPS + 3),  # 1/(1 + exp(−x)): the error of exp, and of a sum and a quotient
+    "index_put": _index_put,
     "clamp": _clamp,
     "relu": lambda program, target, x: x.clamp(min=0),  # whose derivative asks whether x > 0, not whether the result is
     **dict.fromkeys(("gt", "ge", "lt", "le"), _comparison),

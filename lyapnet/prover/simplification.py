@@ -91,7 +91,9 @@ def with_known_times(module: GraphModule, latest: float) -> GraphModule:
         elif source in truths and is_view(node.target):
             truths[node] = truths[source]
         elif name == "where" and source in truths:
-            node.replace_all_uses_with(node.args[1 if truths[source] else 2])
+            chosen = node.args[1 if truths[source] else 2]
+            if _shape(chosen) == _shape(node):
+                node.replace_all_uses_with(chosen)
         elif source in ends and isinstance(node.args[-1], int | float) and not node.kwargs:
             at = [float(node.target(torch.tensor(end, dtype=torch.float64), *node.args[1:])) for end in ends[source]]
             room = DECIDED * (sizes[source] + abs(node.args[-1]))

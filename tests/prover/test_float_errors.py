@@ -38,6 +38,9 @@ FUNCTIONS = {  # x in [−1, 1]², t in [0, 1]
     "hats over time": lambda t, x: (
         torch.relu((t - KNOTS) * 7) - torch.relu((t - KNOTS) * 7 - 1)
     ) @ W[:8, :1] * x[0],
+    "entries at places": lambda t, x: torch.ops.aten.index_put.default(
+        torch.zeros(1, 3).double(), [None, torch.tensor([2, 0, 1])], torch.cat([x, 0.3 * x[:1]])[None], True
+    )[0],
     "products that others use too": lambda t, x: ((p := x[:1] * x[1:] * 1.1) + t) - p * (p - 0.2),
 }  # fmt: skip
 
@@ -60,7 +63,7 @@ def in_single(graph):
     """A graph in float32: torch's own arithmetic, which sums in an order of its own."""
     single = copy.deepcopy(graph).float()
     for name, buffer in single.named_buffers():
-        setattr(single, name, buffer.float())
+        setattr(single, name, buffer.float() if buffer.is_floating_point() else buffer)
     for node in single.graph.nodes:
         if node.kwargs.get("dtype") == torch.float64:
             node.kwargs = {**node.kwargs, "dtype": torch.float32}

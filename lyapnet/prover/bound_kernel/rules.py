@@ -208,7 +208,7 @@ def _index_add(program: Program, x: Any, dim: int, index: Tensor, source: Any) -
 
 @rule(aten.index_put.default)
 def _index_put(program: Program, x: Any, indices: list[Any], values: Any, accumulate: bool = False) -> Forms:
-    return _add_at(program, x, values, lambda base, y: base.index_put(indices, y, accumulate=True))
+    return _add_at(program, x, values, lambda base, y: aten.index_put.default(base, indices, y, True))
 
 
 def _add_at(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor], Tensor]) -> Forms:

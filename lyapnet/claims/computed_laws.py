@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from lyapnet.base.errors import UsageError
+from lyapnet.claims.held_laws import WIDE
 from lyapnet.prover.float_errors import FloatLaw
 from lyapnet.prover.readings import Readings
 from lyapnet.task.sets import Box
@@ -21,10 +22,10 @@ def computed_by(
     Args:
         law: None for a law in real numbers.
         states: D.
-        left_out: states that D does not bound.
+        left_out: states that D does not bound, as nothing depends on them; they are within ±WIDE.
 
     Raises:
-        UsageError: the proof is about another file, or D does not bound a state; or as FloatLaw.errors.
+        UsageError: the proof is about another file; or as FloatLaw.errors.
     """
     kept = None if readings is None else readings.computed
     if readings is None or (law is None and kept is None):
@@ -36,12 +37,8 @@ def computed_by(
             f"Expected --file with the C of this proof, of SHA-256 {kept.sha256}, got {got}; name the folder of its "
             "export."
         )
-    if left_out:
-        raise UsageError(
-            "Expected a set D with bounds of each state that the C takes, got states that nothing depends on, along "
-            "which D has none; certify it without --file."
-        )
     e = torch.tensor(readings.errors, dtype=torch.float64)
+    e[list(left_out)] = WIDE
     found = law.computed_on((states.lower - e, states.upper + e))
     if kept is None:
         more = tuple(a + b for a, b in zip(readings.control_errors, found.errors, strict=True))

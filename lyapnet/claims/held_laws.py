@@ -13,6 +13,9 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlSystem
 from lyapnet.task.varying_limits import VaryingLimits
 
+WIDE = 1e6
+"""Within ± so much a file takes states that nothing depends on and D does not bound, in their units."""
+
 
 def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:
     """When the law is read, and how far this may be off; None for a claim about u read at every t.
@@ -110,19 +113,24 @@ def readings_text(readings: Readings | None, system: ControlSystem) -> str:
     return f"with u read at any times at most {readings.interval!r} s apart{delay}, and held until the next{errors}"
 
 
-def computed_text(readings: Readings | None, system: ControlSystem) -> str:
-    """That a file computes u, as a sentence; empty for real numbers."""
+def computed_text(readings: Readings | None, system: ControlSystem, left_out: Sequence[int]) -> str:
+    """That a file computes u, as a sentence; empty for real numbers.
+
+    Args:
+        left_out: states that nothing depends on.
+    """
     computed = None if readings is None else readings.computed
     if computed is None:
         return ""
+    within = f", with {', '.join(system.state_names[i] for i in left_out)} within ±{WIDE:g}" if left_out else ""
     off = " and ".join(
         f"{error!r} of {name}" for name, error in zip(system.control_names, computed.errors, strict=True)
     )
     return (
         f"u is what policy.h and policy.c of SHA-256 {computed.sha256} (without the comments at their top) compute in "
-        f"{computed.precision} from the measured state, called up to t = {computed.latest!r} s: that is at most {off} "
-        "off, and counted among the errors, given arithmetic of IEEE 754 without -ffast-math, and functions of the C "
-        f"library within {ULPS} units in the last place. "
+        f"{computed.precision} from the measured state{within}, called up to t = {computed.latest!r} s: that is at "
+        f"most {off} off, and counted among the errors, given arithmetic of IEEE 754 without -ffast-math, and "
+        f"functions of the C library within {ULPS} units in the last place. "
     )
 
 

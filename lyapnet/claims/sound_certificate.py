@@ -109,8 +109,8 @@ class SoundCertificate(CostCertificate):
             f"the funnel, or D,{self._or_violates} up to "
             f"T = {claim.duration:g} s, {self._under_disturbances}and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. "
-            f"{computed_text(claim.readings, self.controller.system)}It is about the traced operations of f, g, ℓ, V "
-            f"and u, which have this fingerprint; {FROZEN}{self.parameters_text}"
+            f"{computed_text(claim.readings, self.controller.system, claim.left_out)}It is about the traced "
+            f"operations of f, g, ℓ, V and u, which have this fingerprint; {FROZEN}{self.parameters_text}"
             f"{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 

@@ -43,6 +43,7 @@ from lyapnet.prover.boxes import pieces
 from lyapnet.prover.branch_and_bound import Budget, minimum
 from lyapnet.prover.readings import Computed
 from lyapnet.prover.rounding import mark_rounded
+from lyapnet.prover.simplification import with_limited_arguments
 from lyapnet.prover.taylor import EPSILON
 
 aten = torch.ops.aten
@@ -122,7 +123,7 @@ class FloatLaw:
         return found
 
     def _error(self, j: int, lower: Corner, upper: Corner, boxes: int) -> float:
-        graph = without_shape_sources(self.graph)
+        graph = with_limited_arguments(without_shape_sources(self.graph))
         numbers = FORMATS[self.dtype]
         known, ends = _constants(graph, numbers), list(accumulate(self.sizes))
 

@@ -72,6 +72,26 @@ def _between(start: Node, end: Any) -> list[Node]:
     return [node for node in nodes if node in below & above and node is not start]
 
 
+def with_limited_arguments(module: GraphModule) -> GraphModule:
+    """The graph with y(min(x, c)) in the place of y(x) in each where(x > c, …, y(x)): the same function.
+
+    Softplus is written so. Without the limit the bounds of eˣ overflow where the result is x.
+    """
+    graph = copy.deepcopy(module.graph)
+    for node in list(graph.nodes):
+        truth = next(iter(node.args), None)
+        if node.target is aten.where.self and isinstance(truth, Node) and truth.target is aten.gt.Scalar:
+            x: Any = truth.args[0]
+            with graph.inserting_before(node):
+                copies: dict[Any, Any] = {x: graph.call_function(aten.clamp.default, (x, None, truth.args[1]))}
+                copies[x].meta = dict(x.meta)
+                for each in _between(x, node.args[2]):
+                    copies[each] = graph.node_copy(each, lambda source, known=copies: known.get(source, source))
+            node.args = (*node.args[:2], copies.get(node.args[2], node.args[2]))
+    graph.eliminate_dead_code()
+    return GraphModule(module, graph)
+
+
 DECIDED = 2.0**-22
 """Distance from a threshold, relative to the numbers that were added, beyond which float32 comes to the same truth."""
 

@@ -121,6 +121,13 @@ def test_numbers_that_leave_float32_have_no_bound():
     assert bound(lambda t, x: torch.exp(100 * x[:1]) * 1e-30, torch.float64, boxes=5000)[0] < math.inf
 
 
+def test_a_branch_that_is_not_taken_may_overflow():
+    """Softplus is where(x > 20, x, log1p(exp(x))), and exp(100) is beyond float32."""
+    line = (-1.0, 0.2), (1.0, 0.2)
+    (largest,) = bound(lambda t, x: nn.functional.softplus(100 * x[:1]) / 100, box=line, latest=0.0)
+    assert 2 * UNIT <= largest <= 20 * UNIT
+
+
 def test_operations_whose_errors_are_not_known_are_refused_by_name():
     with pytest.raises(UsageError, match=r"Expected operations whose errors in C are known, got aten.round.+; .+\."):
         bound(lambda t, x: torch.round(x[:1]))

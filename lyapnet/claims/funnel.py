@@ -178,6 +178,7 @@ def prove_funnel(
     if law is not None:
         tell(report, budget, "errors of the C on D")
     condition.readings = readings = computed_by(law, readings, D, left_out)
+    levels = levels if law is None else budget_for_level(budget)  # its time runs from its construction
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))

@@ -6,8 +6,7 @@ from dataclasses import replace
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims.held_laws import WIDE
-from lyapnet.prover.float_errors import FloatLaw
+from lyapnet.prover.float_errors import WIDE, FloatLaw
 from lyapnet.prover.readings import Readings
 from lyapnet.task.sets import Box
 

@@ -7,14 +7,11 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.claims.arguments import of_states
 from lyapnet.claims.claim import ReadAtTimes
 from lyapnet.controller.controller import Controller
-from lyapnet.prover.float_errors import ULPS
+from lyapnet.prover.float_errors import ULPS, WIDE
 from lyapnet.prover.readings import Readings
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlSystem
 from lyapnet.task.varying_limits import VaryingLimits
-
-WIDE = 1e6
-"""Within ± so much a file takes states that nothing depends on and D does not bound, in their units."""
 
 
 def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:

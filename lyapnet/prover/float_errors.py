@@ -50,6 +50,8 @@ aten = torch.ops.aten
 
 ULPS = 4
 """Units in the last place by which functions of the C library are assumed to err at most."""
+WIDE = 1e6
+"""Within ± so much, in its unit, a program takes a state that nothing depends on, which sets of states do not bound."""
 WIDER = 1 + 2.0**-10
 FOLDED = 4.0  # units of float64 by which a constant that torch computed may be off in the claim
 TOLERANCE = 0.2  # relative to the largest S, up to which boxes are cut

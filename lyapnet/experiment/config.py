@@ -5,6 +5,7 @@ A YAML file lists only values that differ from these defaults; `key.sub=value` o
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,9 @@ from lyapnet.experiment.csv_columns import read_columns
 from lyapnet.experiment.recipe import STANDARD, with_recipe
 from lyapnet.experiment.schema import Names, check_values, checked, differences, read_yaml, setting
 from lyapnet.task.models.reading import KINDS
+
+MOST_LINES = 20  # lines of equations in tables and text of loggers
+EQUATIONS = "EQUATIONS"  # in their place while the rest is written as YAML
 
 # names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
@@ -488,9 +492,27 @@ def to_plain(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def abridged(config: Config) -> Config:
+    """The config for tables and text of loggers: of long equations, the first lines."""
+    lines = config.system.equations.splitlines()
+    if len(lines) <= MOST_LINES:
+        return config
+    text = "\n".join([*lines[:MOST_LINES], f"# and {len(lines) - MOST_LINES} further lines, in config.yaml"])
+    return dataclasses.replace(config, system=dataclasses.replace(config.system, equations=text))
+
+
 def to_yaml(config: Config) -> str:
-    """The resolved config as YAML; one number for all readings is written as such."""
+    """The resolved config as YAML; one number for all readings is written as such, and equations line by line."""
     plain = to_plain(config)
+    if equations := plain["system"]["equations"]:
+        plain["system"]["equations"] = EQUATIONS
+        ending = "+" if equations.endswith("\n") else "-"
+        block = f"equations: |2{ending}\n{textwrap.indent(equations, '    ')}".removesuffix("\n")
+        return _to_yaml(plain).replace(f"equations: {EQUATIONS}", block, 1)
+    return _to_yaml(plain)
+
+
+def _to_yaml(plain: dict[str, Any]) -> str:
     if len(plain["outputs"]["noise"] or []) == 1:
         (plain["outputs"]["noise"],) = plain["outputs"]["noise"]
     return OmegaConf.to_yaml(OmegaConf.create(plain))

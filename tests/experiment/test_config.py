@@ -13,7 +13,16 @@ from omegaconf import MISSING
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly import build_problem
-from lyapnet.experiment.config import Config, config_from_plain, load_config, outline, to_plain, to_yaml
+from lyapnet.experiment.config import (
+    MOST_LINES,
+    Config,
+    abridged,
+    config_from_plain,
+    load_config,
+    outline,
+    to_plain,
+    to_yaml,
+)
 from lyapnet.experiment.recipe import STANDARD
 from lyapnet.loop.programs import LyapunovProgram
 from lyapnet.training.build import build_module
@@ -445,6 +454,24 @@ def test_config_survives_plain_data_and_yaml(path, tmp_path):
     written = tmp_path / "written.yaml"
     written.write_text(to_yaml(config))
     assert load_config(written) == config
+
+
+@pytest.mark.parametrize("ending", ["", "\n", "\n\n"])
+def test_equations_are_written_line_by_line(ending, plain):
+    equations = f"  a = -x  # as in the book\n\nder(x) = a + u{ending}"
+    given = {**plain, "system": {"name": "equations", "equations": equations, "states": {"x": "m"}}}
+    config = config_from_plain({**given, "target": None})
+    text = to_yaml(config)
+    assert "\n    der(x) = a + u\n" in text
+    assert config_from_plain(yaml.safe_load(text)) == config
+
+
+def test_loggers_have_the_first_lines_of_long_equations(plain):
+    lines = [f"v{k} = x + {k}" for k in range(MOST_LINES + 5)]
+    given = {**plain, "system": {"name": "equations", "equations": "\n".join(lines), "states": {"x": "m"}}}
+    shown = abridged(config_from_plain(given))
+    assert shown.system.equations.splitlines() == [*lines[:MOST_LINES], "# and 5 further lines, in config.yaml"]
+    assert abridged(shown) == config_from_plain(to_plain(abridged(shown)))
 
 
 def test_defaults_are_not_shared_between_configs(plain):

@@ -70,7 +70,7 @@ def model_of_function(function: Any, states: Sequence[str] = (), controls: Seque
     import casadi
 
     try:
-        expanded = function if function.is_a("SXFunction") else function.expand()
+        expanded = function if function.is_a("SXFunction") else _expanded(casadi, function)
     except RuntimeError as error:
         raise UsageError(
             f"Expected a CasADi function of elementary operations, got {function.name()}, which CasADi cannot expand "
@@ -93,6 +93,29 @@ def model_of_function(function: Any, states: Sequence[str] = (), controls: Seque
     return Model("\n".join(lines), x, u, [name for each in p for name in each], list(_values(function, inputs, result)))
 
 
+def _expanded(casadi: Any, function: Any) -> Any:
+    """An MX function as elementary operations, linear solves included, which CasADi does not expand by itself."""
+    inputs = function.mx_in()
+    results = function.call(inputs, True, False)  # with the functions that it calls written out
+    inlined = casadi.Function(function.name(), inputs, results)
+    operations = [k for k in range(inlined.n_instructions()) if inlined.instruction_id(k) == casadi.OP_SOLVE]
+    if not operations:
+        return function.expand()
+    solves = [inlined.instruction_MX(k) for k in operations]
+    symbols = [casadi.MX.sym(f"solution_{k}", each.sparsity()) for k, each in enumerate(solves)]
+    systems = [each.dep(i) for each in solves for i in (1, 0)]  # A and B of each A Y = B
+    parts = casadi.Function(
+        function.name(), [*inputs, *symbols], casadi.graph_substitute([*systems, *results], solves, symbols)
+    ).expand()
+    given = function.sx_in()
+    solutions = [casadi.SX.zeros(each.sparsity()) for each in symbols]
+    for k, each in enumerate(solves):  # in the order of the function, so that each needs those before it alone
+        A, B = parts.call([*given, *solutions])[2 * k : 2 * k + 2]
+        solutions[k] = casadi.solve(A.T if each.info()["tr"] else A, B)
+    written = [casadi.cse(each) for each in parts.call([*given, *solutions])[len(systems) :]]
+    return casadi.Function(function.name(), given, written, function.name_in(), function.name_out())
+
+
 def function_of_text(casadi: Any, text: str) -> Any:
     """The function in the text of Function.save or Function.serialize.
 
@@ -113,7 +136,7 @@ def function_of_text(casadi: Any, text: str) -> Any:
 
 def _inputs_of(function: Any) -> list[int]:
     """The indices of x, u and the parameters."""
-    names = [name.lower() for name in function.name_in()]
+    names = [name.lower().strip("_") for name in function.name_in()]  # do-mpc has _x, _u, _z, _tvp, _p, _w
     used = [i for i in range(function.n_in()) if function.numel_in(i)]
     first = [names.index("x"), names.index("u")] if {"x", "u"} <= {*names} else used[:2]
     if len(first) < 2 or not all(i in used for i in first):
@@ -128,6 +151,11 @@ def _inputs_of(function: Any) -> list[int]:
                 f"Expected inputs that are dense columns, got {function.name_in(i)} of shape {function.size_in(i)}; "
                 "pass columns."
             )
+    if any(names[i] == "z" for i in others):
+        raise UsageError(
+            f"Expected ẋ as a function of x, u and p in {function.name()}, got algebraic states z; solve for them, by "
+            "casadi.solve where their equations are linear."
+        )
     time = [i for i in others if names[i] in ("t", "time") and function.numel_in(i) == 1]
     depends = [i for i in time if any(function.jac_sparsity(k, i).nnz() for k in range(function.n_out()))]
     if depends:
@@ -218,12 +246,13 @@ def _number(value: float) -> str:
 
 
 def _values(function: Any, inputs: Sequence[int], result: int) -> Iterator[list[float]]:
-    """Values of x, u, p and ẋ at random points, by CasADi's own evaluation."""
+    """Values of x, u, p and ẋ at random points, x and u positive at half of them, by CasADi's own evaluation."""
     draw = random.Random(0)
-    for _ in range(POINTS):
+    for k in range(POINTS):
         given = [[0.0] * function.numel_in(i) for i in range(function.n_in())]
         for i in inputs:
-            given[i] = [draw.uniform(0.5, 1.5) if i in inputs[2:] else draw.gauss(0, 1) for _ in given[i]]
+            positive = i in inputs[2:] or k % 2  # as parameters, levels and concentrations are
+            given[i] = [draw.uniform(0.5, 1.5) if positive else draw.gauss(0, 1) for _ in given[i]]
         value = function.call(given)[result]
         flat = [float(value[k]) for k in range(value.numel())]
         yield [*(number for i in inputs for number in given[i]), *flat]

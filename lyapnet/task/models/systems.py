@@ -87,8 +87,9 @@ def _require_equal(model: Model, cls: type[EquationSystem], name: str) -> None:
         x, u, p, expected = numbers.split([n, m, len(model.parameters), n])
         system = cls(**dict(zip(model.parameters, p.tolist(), strict=True)))
         got = system.dynamics(x, u)
-        same = (got - expected).abs() <= TOLERANCE * (1 + expected.abs().amax())
-        if not bool((same | ~expected.isfinite()).all()):
+        finite = expected.isfinite()
+        same = (got - expected).abs() <= TOLERANCE * (1 + expected.where(finite, 0.0).abs().amax())
+        if not bool((same | ~finite).all()):
             raise UsageError(
                 f"Expected equations that equal {name}, got ẋ = {got.tolist()} in the place of {expected.tolist()} at "
                 f"x = {x.tolist()}; report this with the model."

@@ -165,6 +165,56 @@ def config(folder, **system):
     return path
 
 
+@pytest.mark.parametrize("kind", [SX, MX])
+def test_the_right_hand_side_of_do_mpc(kind):
+    names = ["_x", "_u", "_z", "_tvp", "_p", "_w"]  # of model._rhs_fun
+    x, u, z, tvp, p, w = given = [kind.sym(*each) for each in zip(names, (2, 1, 0, 0, 1, 0), strict=True)]
+    rate = casadi.vertcat(x[1], u / p - x[0])
+    system = casadi_system(Function("rhs_fun", given, [rate], names, ["_rhs"]), _p=2.0)
+    assert list(system.state_names) == ["_x_0", "_x_1"]
+    assert_close(system.g(torch.zeros(1, 2, dtype=torch.float64))[0, 1, 0].item(), 0.5)
+    z = kind.sym("_z", 1)
+    said = refusal(Function("rhs_fun", [x, u, z, tvp, p, w], [rate + z], names, ["_rhs"]), _p=2.0)
+    assert "algebraic states z; solve for them" in said
+
+
+@pytest.mark.parametrize("inner", [False, True])
+def test_linear_solves_are_written_out(inner):
+    x, u = MX.sym("x", 3), MX.sym("u")
+    A = casadi.blockcat([[3 + casadi.cos(x[0]), x[1], 0.3], [0.5, 4, casadi.sin(x[2])], [x[0], 0.1, 5]])
+    first = casadi.solve(A.T, casadi.vertcat(x[:2], u))
+    rate = casadi.inv(A + casadi.diag(first)) @ x + casadi.solve(A, first)
+    function = Function("f", [x, u], [rate], ["x", "u"], ["xdot"])
+    with pytest.raises(RuntimeError):
+        function.expand()  # which CasADi does not do
+    if inner:
+        function = Function("outer", [x, u], [2 * function(x, u)], ["x", "u"], ["xdot"])
+    states, controls = np.random.default_rng(0).normal(size=(50, 3)) / 3, np.linspace(-1, 1, 50)
+    got = casadi_system(function).dynamics(torch.tensor(states), torch.tensor(controls)[:, None])
+    expected = np.array([function(*each).full().ravel() for each in zip(states, controls, strict=True)])
+    assert_close(got.numpy(), expected, rtol=1e-12, atol=1e-13)
+
+
+def test_accelerations_by_a_linear_solve_are_affine():
+    x, u = MX.sym("x", 2), MX.sym("u")
+    M = casadi.blockcat([[2, casadi.cos(x[0])], [casadi.cos(x[0]), 1]])
+    assert casadi_system(Function("f", [x, u], [casadi.solve(M, casadi.vertcat(u, x[1]))])).affine
+
+
+def test_a_value_that_is_not_finite_is_compared_no_further():
+    x, u = SX.sym("x", 2), SX.sym("u")
+    system = casadi_system(Function("f", [x, u], [casadi.sqrt(x) + u]))
+    at = torch.tensor([[4.0, 9.0]], dtype=torch.float64)
+    assert_close(system.f(at), at.sqrt())
+
+
+def test_a_wrong_operation_is_found_where_other_entries_are_not_finite(monkeypatch):
+    monkeypatch.setitem(EXPRESSIONS, "SIN", "cos({0})")
+    x, u = SX.sym("x", 2), SX.sym("u")
+    rate = casadi.vertcat(casadi.log(-casadi.fabs(x[0])), casadi.sin(x[1]) + u)
+    assert "report this with the model" in refusal(Function("f", [x, u], [rate]))
+
+
 @pytest.mark.gate
 @pytest.mark.parametrize("write", [lambda f, path: f.save(str(path)), lambda f, path: path.write_text(f.serialize())])
 def test_a_file_is_trained_and_its_checkpoint_needs_it_no_more(write, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from lyapnet.experiment.config import load_config
 from lyapnet.task.models import reading, robots
 from lyapnet.task.models.systems import TOLERANCE
 from lyapnet.task.systems.equations import defined
-from tests.task.models.robot_files import mjcf, urdf
+from tests.task.models.robot_files import ROBOTS, mjcf, urdf
 
 pytest.importorskip("adam")
 mujoco = pytest.importorskip("mujoco")
@@ -84,6 +84,14 @@ def test_other_elements_of_mjcf_are_refused(option, part):
     with pytest.raises(UsageError, match="Expected") as error:
         robots.model_of_mjcf(text.encode())
     assert part in str(error.value)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_named_robot_moves_as_in_mujoco(name):
+    kind, text, sections = ROBOTS[name]
+    model = (robots.model_of_urdf if kind == "urdf" else robots.model_of_mjcf)(text.encode())
+    assert len(sections["initial_states"]["lower"]) == len(model.states)
+    assert difference(text, model) < 1e-9
 
 
 def arm(**limit):

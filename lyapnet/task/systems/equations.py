@@ -70,7 +70,7 @@ class EquationSystem(ControlSystem):
                 raise UsageError(f"Expected a number for system.parameters.{name}, got {parameters[name]!r}; give one.")
             setattr(self, self.attribute_of(name), parameters[name])
         self.is_affine = True
-        self.is_affine = self._split(torch.zeros(self.n)) is not None
+        self.is_affine = self._slopes(torch.zeros(self.n)) is not None
 
     @property
     def affine(self) -> bool:
@@ -85,27 +85,28 @@ class EquationSystem(ControlSystem):
 
     def dynamics(self, x: State, u: Control) -> State:
         x, u = _same_batch(x, u)
-        return torch.stack(self.formulas(self._values(x, u), x[..., 0]), -1)
+        return torch.stack(self.formulas(self._values(x, u.unbind(-1)), x[..., 0]), -1)
 
     def f(self, x: State) -> State:
-        parts = self._split(x)
-        return super().f(x) if parts is None else torch.stack(parts[0], -1)
+        if not self.is_affine:
+            return super().f(x)
+        return torch.stack(self.formulas(self._values(x, [0.0] * self.m), x[..., 0]), -1)
 
     def g(self, x: State) -> InputMatrix:
-        parts = self._split(x)
-        return super().g(x) if parts is None else torch.stack([torch.stack(row, -1) for row in parts[1]], -2)
+        slopes = self._slopes(x)
+        return super().g(x) if slopes is None else torch.stack([torch.stack(row, -1) for row in slopes], -2)
 
-    def _split(self, x: State) -> tuple[list[Tensor], list[list[Tensor]]] | None:
-        """The entries of f and g; None if the operations of the equations are not affine in u."""
+    def _slopes(self, x: State) -> list[list[Tensor]] | None:
+        """The entries of g; None if the operations of the equations are not affine in u."""
         if not self.is_affine:
             return None
         controls = [written(name) for name in self.control_names]
-        return self.formulas.affine(self._values(x, x.new_zeros(*x.shape[:-1], self.m)), controls, x[..., 0])
+        return self.formulas.slopes(self._values(x, [0.0] * self.m), controls, x[..., 0])
 
-    def _values(self, x: State, u: Control) -> dict[str, Number]:
+    def _values(self, x: State, u: Sequence[Number]) -> dict[str, Number]:
         """The numbers that the equations name."""
         parameters = (getattr(self, self.attribute_of(name)) for name in self.definition.parameters)
-        return dict(zip(self.definition.names, (*x.unbind(-1), *u.unbind(-1), *parameters), strict=True))
+        return dict(zip(self.definition.names, (*x.unbind(-1), *u, *parameters), strict=True))
 
     def __reduce__(self) -> Any:
         """For copies in other processes, which find the class by its definition."""

@@ -9,7 +9,7 @@ import ast
 import functools
 import math
 import operator
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,13 +102,6 @@ class Instruction(NamedTuple):
     operands: tuple[int, ...]
 
 
-class Affine(NamedTuple):
-    """A number c + Σ b_j u_j that is affine in the controls: c, and b_j by control."""
-
-    rest: Number
-    slopes: dict[int, Number]
-
-
 class Formulas:
     """Functions of named numbers, as a flat list of operations in which each expression stands once.
 
@@ -143,38 +136,46 @@ class Formulas:
             only: which results, by their index; None: all.
         """
         chosen = [place for k, place in enumerate(self.results) if only is None or k in only]
-        found: dict[int, Number] = {**self.constants, **{k: values[name] for k, name in enumerate(self.names)}}
-        for place in self._needed(chosen):
-            operation, operands = self.instructions[place]
-            found[place] = _computed(operation, [found[k] for k in operands], like)
+        found = self._computed(values, chosen, like)
         return [_filled(found[place], like) for place in chosen]
 
-    def affine(
-        self, values: Mapping[str, Number], controls: Sequence[str], like: Tensor
-    ) -> tuple[list[Tensor], list[list[Tensor]]] | None:
-        """The results as c + Σ_j b_j u_j: (c, [b_1, …, b_m] of each result); None if one is not affine in u.
+    def slopes(self, values: Mapping[str, Number], controls: Sequence[str], like: Tensor) -> list[list[Tensor]] | None:
+        """[b_1, …, b_m] of each result c + Σ_j b_j u_j; None if one is not affine in u.
 
-        Whether they are is decided by the operations alone, the same for all values.
+        Whether they are is decided by the operations alone, the same for all values. What b needs alone is computed.
         """
-        given = {k: values[name] for k, name in enumerate(self.names) if name not in controls}
-        found = {k: Affine(value, {}) for k, value in {**self.constants, **given}.items()}
-        for k, name in enumerate(self.names):
-            if name in controls:
-                found[k] = Affine(0.0, {list(controls).index(name): 1.0})
+        slopes: dict[int, dict[int, Number]] = {self.names.index(name): {j: 1.0} for j, name in enumerate(controls)}
+        moved, factors = list[int](), set[int]()  # instructions that depend on u, and what these slopes are scaled by
+        depends = set(slopes)
         for place in self._needed(self.results):
             operation, operands = self.instructions[place]
-            result = _affine_result(operation, [found[k] for k in operands], like)
-            if result is None:
+            if depends.isdisjoint(operands):
+                continue
+            scales = _factors(operation, [k in depends for k in operands])
+            if scales is None:
                 return None
-            found[place] = result
-        results = [found[place] for place in self.results]
+            factors.update(operands[i] for i in scales)
+            depends.add(place)
+            moved.append(place)
+        found = self._computed({k: v for k, v in values.items() if k not in controls}, factors, like)
+        for place in moved:
+            operation, operands = self.instructions[place]
+            slopes[place] = _slopes(
+                operation, [slopes.get(k, {}) for k in operands], [found.get(k, 0.0) for k in operands], like
+            )
         columns = range(len(controls))
-        return (
-            [_filled(each.rest, like) for each in results],
-            [[_filled(each.slopes.get(j, 0.0), like) for j in columns] for each in results],
-        )
+        return [[_filled(slopes.get(place, {}).get(j, 0.0), like) for j in columns] for place in self.results]
 
-    def _needed(self, results: Sequence[int]) -> list[int]:
+    def _computed(self, values: Mapping[str, Number], places: Iterable[int], like: Tensor) -> dict[int, Number]:
+        """The numbers at some places, and at those on which they depend."""
+        given = {k: values[name] for k, name in enumerate(self.names) if name in values}
+        found: dict[int, Number] = {**self.constants, **given}
+        for place in self._needed(places):
+            operation, operands = self.instructions[place]
+            found[place] = _computed(operation, [found[k] for k in operands], like)
+        return found
+
+    def _needed(self, results: Iterable[int]) -> list[int]:
         """The places of the instructions on which results depend, in the order of the text."""
         needed, waiting = set[int](), list(results)
         while waiting:
@@ -325,37 +326,42 @@ def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Numbe
     return _OPERATIONS[operation].of_tensors(*(_tensor(_as_number(each, like), like) for each in operands))
 
 
-def _affine_result(operation: str, operands: Sequence[Affine], like: Tensor) -> Affine | None:
-    """The result of an operation on numbers that are affine in u; None if it is not affine."""
-    rests = [each.rest for each in operands]
-    if not any(each.slopes for each in operands):
-        return Affine(_computed(operation, rests, like), {})
+def _factors(operation: str, depends: Sequence[bool]) -> list[int] | None:
+    """Which operands scale or choose the slopes of a result, if some operands depend on u; None if it is not affine."""
+    match operation, *depends:
+        case ("+" | "-" | "negative", *_):
+            return []
+        case ("*", True, False):
+            return [1]
+        case ("*", False, True):
+            return [0]
+        case ("/", True, False):
+            return [1]
+        case ("where", False, *_):
+            return [0]
+    return None
 
-    def scaled(slopes: Mapping[int, Number], by: str, factor: Number) -> dict[int, Number]:
-        return {j: _computed(by, [slope, factor], like) for j, slope in slopes.items()}
+
+def _slopes(
+    operation: str, slopes: Sequence[Mapping[int, Number]], numbers: Sequence[Number], like: Tensor
+) -> dict[int, Number]:
+    """The slopes by control of a result, from those of its operands, and the numbers that scale or choose them."""
+    columns = {j: None for each in slopes for j in each}
+
+    def of(k: int, j: int) -> Number:
+        return slopes[k].get(j, 0.0)
 
     match operation:
-        case "+" | "-":
-            a, b = operands
-            slopes = dict(a.slopes)
-            for j, slope in b.slopes.items():
-                slopes[j] = _computed(operation, [slopes.get(j, 0.0), slope], like)
         case "negative":
-            slopes = {j: _computed("negative", [slope], like) for j, slope in operands[0].slopes.items()}
-        case "*" if not operands[0].slopes or not operands[1].slopes:
-            a, b = operands if operands[0].slopes else operands[::-1]
-            slopes = scaled(a.slopes, "*", b.rest)
-        case "/" if not operands[1].slopes:
-            slopes = scaled(operands[0].slopes, "/", operands[1].rest)
-        case "where" if not operands[0].slopes:
-            condition, a, b = operands
-            slopes = {
-                j: _computed("where", [condition.rest, a.slopes.get(j, 0.0), b.slopes.get(j, 0.0)], like)
-                for j in {**a.slopes, **b.slopes}
-            }
+            return {j: _computed("negative", [of(0, j)], like) for j in columns}
+        case "+" | "-":
+            first = dict(slopes[0])
+            return first | {j: _computed(operation, [of(0, j), of(1, j)], like) for j in slopes[1]}
+        case "where":
+            return {j: _computed("where", [numbers[0], of(1, j), of(2, j)], like) for j in columns}
         case _:
-            return None
-    return Affine(_computed(operation, rests, like), slopes)
+            k = 0 if slopes[0] else 1
+            return {j: _computed(operation, [slope, numbers[1 - k]], like) for j, slope in slopes[k].items()}
 
 
 def _tensor(value: Number, like: Tensor) -> Tensor:

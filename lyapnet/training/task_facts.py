@@ -428,7 +428,9 @@ def _format_count(number: int, what: str) -> str:
 
 
 def _format_vector(values: Tensor) -> str:
-    return format_numbers(values.tolist())
+    """The entries in brackets, with 0 for what is rounding beside the largest."""
+    rounding = values.abs() < 1e-12 * values.abs().amax()
+    return format_numbers(values.masked_fill(rounding, 0.0).tolist())
 
 
 def _format_seconds(seconds: float) -> str:

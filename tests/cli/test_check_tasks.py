@@ -105,6 +105,7 @@ CHAINS = Own(
 QUATERNION = Own(4, lambda x: torch.zeros_like(x), [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FLEA = Own(2, stacked(lambda x, v: (v, -9.81e-12 * x)), [[0], [1e12]])
 GRAVITY = Own(2, stacked(lambda x, v: (v, 0 * x - 9.81)), [[0], [1]])
+ROUNDED = Own(2, stacked(lambda x, v: (0 * x + 1e-14, 0 * v - 9.81)), [[1, 0], [0, 1]])
 LENGTH = Own(2, stacked(lambda x, v: (v, torch.tensor(1 / 0.3) * (x - 0.1))), [[0], [1]])  # in the default precision
 UNSTABLE = Own(2, stacked(lambda x, y: (0.5 * x, -y)), [[0], [1]])
 TABLE = lyapnet.Table([[0.0, 0.5, 1.0]], [2.0, 2.0, 1.0])
@@ -125,6 +126,7 @@ TASKS = {
     "badly scaled": (FLEA, {"lower": [-1e-6, -1e3], "upper": [1e-6, 1e3]}, {"controllable": "yes"}),
     "tight limits": (GRAVITY, {"controls": {"lower": 0, "upper": 1}}, {"goal": "held by u = (9.81)"}),
     "target": (GRAVITY, {"target": [1, 0]}, {"goal": "(1, 0), an equilibrium at u = (9.81)"}),
+    "rounding": (ROUNDED, {"target": [1, 0]}, {"goal": "(1, 0), an equilibrium at u = (0, 9.81)"}),
     "explicit target_control": (GRAVITY, {"target": [1, 0], "target_control": 0}, {"goal": "which the cost charges"}),
     "constants of f": (LENGTH, {"target": [0.4, 0]}, {"goal": "(0.4, 0), an equilibrium at u = (-1)"}),
     "unreached": (UNSTABLE, {}, {"controllable": "does not reach 0.5"}),

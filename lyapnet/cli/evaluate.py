@@ -34,6 +34,10 @@ def evaluate(
         float | None,
         typer.Option(help="Also where each law that can follow T leads, up to this many T.", metavar="MULTIPLE"),
     ] = None,
+    plant: Annotated[
+        Path | None,
+        typer.Option(help="Also in MuJoCo's simulator, on the plant of this MJCF or URDF file.", metavar="FILE.xml"),
+    ] = None,
     paths: Annotated[
         int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
     ] = 32,
@@ -50,6 +54,7 @@ def evaluate(
     once for each state: the next evaluation of any controller of the task reads it.
     """
     from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
+    from lyapnet.evaluation.in_simulator import read_plant, simulate
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.robustness import not_varied, robustness
     from lyapnet.evaluation.tables import evaluation_table
@@ -61,6 +66,7 @@ def evaluate(
     controller = given.load()
     filtered = estimator_of(controller, outputs or [], estimator, deviation)
     count = min(samples, 64)
+    simulated = None if plant is None else read_plant(plant, controller)
     if until is not None:
         check_multiple(controller, until, count)
     report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
@@ -80,11 +86,14 @@ def evaluate(
         report(f"closed loops up to {until:g} T")
         later = loops_after_horizon(controller, measured.table.x0[:count], until)
         result["afterwards"] = in_plain_data(later, controller, until)
+    if simulated is not None:
+        report(f"closed loops in MuJoCo from {count} states")
+        result["simulator"] = simulate(controller, simulated, measured.table.x0[:count]).summary()
     report.rest()
     if as_json:
         print(json.dumps(result))
     else:
-        _print_further_tables(result, controller, count)
+        _print_further_tables(result, controller, count, "" if plant is None else plant.name)
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
@@ -95,15 +104,17 @@ def evaluate(
         notes.print(wrote, soft_wrap=True)
 
 
-def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:
+def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int, plant: str) -> None:
     """What was asked for besides, from `count` states."""
     from lyapnet.evaluation.robustness import nominal
-    from lyapnet.evaluation.tables import after_horizon_table, robustness_table
+    from lyapnet.evaluation.tables import after_horizon_table, robustness_table, simulator_table
 
     console, noisy = Console(highlight=False, markup=False), controller.problem.noise is not None
     if "robustness" in result:
         unchanged = result["robustness_unchanged"]
         console.print(robustness_table(result["robustness"], count, nominal(controller), noisy, unchanged))
+    if "simulator" in result:
+        console.print(simulator_table(result["simulator"], plant, count))
     if "afterwards" in result:
         console.print(after_horizon_table(result["afterwards"], count, noisy))
 

@@ -246,6 +246,24 @@ def robustness_table(
     return table
 
 
+def simulator_table(row: Mapping[str, float], plant: str, samples: int) -> Table:
+    """The table of closed loops in MuJoCo, from SimulatedLoops.summary."""
+    columns = (
+        "cost J in MuJoCo",
+        "J of the model",
+        "ratio",
+        "largest ratio",
+        "finite",
+        "at most 1.1 times the model's",
+    )
+    table = Table(*(Column(name, justify="right") for name in columns), title=f"in MuJoCo on {plant}, {samples} states")
+    keys = ("simulated_cost_mean", "model_cost_mean", "cost_ratio", "largest_ratio")
+    shares = (f"{row[key]:.0%}" for key in ("finite_fraction", "as_good_fraction"))
+    table.add_row(*(f"{row[key]:.4g}" for key in keys), *shares)
+    table.caption = "both in continuous time with u held for Δt"
+    return table
+
+
 def after_horizon_table(rows: list[dict[str, Any]], samples: int, noisy: bool) -> Table:
     """The table of distances after T under each law, from after_horizon.in_plain_data.
 

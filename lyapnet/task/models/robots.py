@@ -90,8 +90,8 @@ def model_of_mjcf(content: bytes, states: Sequence[str] = (), controls: Sequence
 
 def _model(robot: Robot, states: Sequence[str], controls: Sequence[str]) -> Model:
     joints = robot.joints
-    own = [name for form in ("{}", "{}_rate") for name in (form.format(_identifier(each.name)) for each in joints)]
-    motors = [_identifier(each.name) for each in robot.actuators]
+    own = [name for form in ("{}", "{}_rate") for name in (form.format(identifier(each.name)) for each in joints)]
+    motors = [identifier(each.name) for each in robot.actuators]
     taken = {*own}
     motors = [name if name not in taken else f"{name}_{'force' if joints[each.joint].slides else 'torque'}"
               for name, each in zip(motors, robot.actuators, strict=True)]  # fmt: skip
@@ -106,7 +106,7 @@ def _model(robot: Robot, states: Sequence[str], controls: Sequence[str]) -> Mode
     )
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str) -> str:
     """A name of letters, digits and _."""
     text = re.sub(r"\W", "_", name)
     return text if text[:1].isalpha() else f"joint_{text}"

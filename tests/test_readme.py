@@ -134,6 +134,10 @@ def test_every_command_is_understood(workplace):
         if arguments[0] in ("train", "sweep"):
             experiments = given["config"] if arguments[0] == "sweep" else [given["config"]]
             for experiment in experiments:
+                names = f"{Path(experiment).stem}.yaml", f"experiment: {Path(experiment).stem}\n"
+                shown = [block for block in blocks("yaml") if any(name in block for name in names)]
+                if shown and not Path(experiment).exists():  # a file that a page shows
+                    (workplace / experiment).write_text(shown[0], encoding="utf-8")
                 load_config(experiment, list(given["overrides"] or ()))
         elif arguments[0] == "compare":
             assert load_comparison(given["config"]).tasks

@@ -9,6 +9,7 @@ from scipy.linalg import solve_continuous_are
 
 import lyapnet
 from lyapnet.base.errors import UsageError
+from lyapnet.base.linear_algebra import apply
 from lyapnet.cli import main
 from lyapnet.evaluation.in_simulator import read_plant, simulate
 from lyapnet.experiment.assembly import build_problem
@@ -29,6 +30,8 @@ PENDULUM = (
 class Quadratic(lyapnet.ValueFunction):
     """V = xᵀPx of the linear-quadratic regulator at the goal, without end."""
 
+    P: torch.Tensor
+
     def __init__(self, problem):
         super().__init__()
         zero = torch.zeros(2, dtype=torch.float64)
@@ -37,7 +40,7 @@ class Quadratic(lyapnet.ValueFunction):
         self.register_buffer("P", torch.from_numpy(P))
 
     def forward(self, t, x):
-        return ((x @ self.P) * x).sum(-1)
+        return (x * apply(self.P, x)).sum(-1)
 
 
 @pytest.fixture(scope="module")

@@ -139,8 +139,8 @@ def test_what_is_about_a_goal_that_stays_is_left_out_or_refused():
         Regulator(task)
     z, u = on_reference(torch.tensor([0.3]))
     assert_close(torch.from_numpy(Rest(task).law()(0, z[0].numpy())), u[0], atol=0.05, rtol=0)
-    assert not PredictiveControl(task, 10)._tail.hessian.any()
-    assert PredictiveControl(problem(reference={}), 10)._tail.hessian.any()
+    assert not PredictiveControl(task, 10)._tail.parameters.any()
+    assert PredictiveControl(problem(reference={}), 10)._tail.parameters.any()
 
 
 def test_an_estimator_begins_at_the_beginning():

@@ -1,5 +1,8 @@
 """The registered systems. A new one is a subclass and one line in SYSTEMS, or `module:Class` in a config."""
 
+from collections import ChainMap
+from collections.abc import Mapping
+
 from lyapnet.task.systems.acrobot import Acrobot
 from lyapnet.task.systems.base import (
     ControlAffineSystem,
@@ -43,7 +46,7 @@ SYSTEMS: dict[str, type[ControlSystem]] = {
     "glider": Glider,
 }
 BY_EQUATIONS = ("equations", "casadi", "urdf", "mjcf")  # equations in a config, or read from a model's file
-NAMED_SYSTEMS: dict[str, type[ControlSystem]] = {**SYSTEMS, **dict.fromkeys(BY_EQUATIONS, EquationSystem)}
+NAMED_SYSTEMS: Mapping[str, type[ControlSystem]] = ChainMap(SYSTEMS, dict.fromkeys(BY_EQUATIONS, EquationSystem))
 
 __all__ = [
     "BY_EQUATIONS",

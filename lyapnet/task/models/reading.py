@@ -18,6 +18,7 @@ from lyapnet.base.files import LARGEST_TEXT, read_file
 EXTRAS = {"casadi": "oracle", "urdf": "robots", "mjcf": "robots,mujoco"}  # what each kind of model needs
 KINDS = tuple(EXTRAS)
 SECONDS = 60  # of CPU, and twice as many by the clock
+LINEAR_SOLVERS = ("qr", "ldl", "symbolicqr", "csparse", "lsqr")  # CasADi's own, each in a library
 MEMORY = 8 * 2**30  # bytes of addresses, of which CasADi's libraries alone take about one
 
 _CHILD = (
@@ -87,6 +88,8 @@ def _reader(kind: str) -> Any:
 
             from lyapnet.task.models.casadi_functions import function_of_text, model_of_function
 
+            for name in LINEAR_SOLVERS:
+                casadi.has_linsol(name)  # loads it
             return lambda content, name, **options: model_of_function(
                 function_of_text(casadi, content.decode("ascii")), **options
             )._asdict()

@@ -6,6 +6,7 @@ import torch
 
 casadi = pytest.importorskip("casadi")
 
+from lyapnet.task.models.reading import LINEAR_SOLVERS, read_model  # noqa: E402
 from lyapnet.task.models.systems import casadi_system  # noqa: E402
 from tests.task.models.casadi_models import MODELS  # noqa: E402
 
@@ -28,3 +29,13 @@ def test_a_model_equals_casadi(name):
     if affine:
         by_parts = system.f(x) + (system.g(x) @ u[..., None])[..., 0]
         assert np.abs((by_parts.numpy() - expected) / scale).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", LINEAR_SOLVERS)
+def test_a_file_may_have_linear_solves(name, tmp_path):
+    x, u = casadi.MX.sym("x", 2), casadi.MX.sym("u")
+    A = casadi.blockcat([[3, casadi.cos(x[0])], [casadi.cos(x[0]), 2]])
+    function = casadi.Function("f", [x, u], [casadi.solve(A, casadi.vertcat(x[1], u), name)], ["x", "u"], ["xdot"])
+    function.save(str(tmp_path / "plant.casadi"))
+    read = read_model(tmp_path / "plant.casadi", "casadi", {"states": [], "controls": []})
+    assert read["equations"] == casadi_system(function).definition.equations

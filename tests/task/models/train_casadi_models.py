@@ -34,12 +34,14 @@ HEADER = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", default=[*MODELS, *ROBOTS], choices=[*MODELS, *ROBOTS], metavar="NAME")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join([*MODELS, *ROBOTS])}; none: all")
     parser.add_argument("--folder", type=Path, default=Path("casadi_models"))
     given = parser.parse_args()
+    if unknown := {*given.names} - {*MODELS, *ROBOTS}:
+        parser.error(f"Expected names of {', '.join([*MODELS, *ROBOTS])}, got {', '.join(unknown)}; correct them.")
     given.folder.mkdir(parents=True, exist_ok=True)
     print(HEADER, flush=True)
-    for name in given.names:
+    for name in given.names or [*MODELS, *ROBOTS]:
         print(_row(name, given.folder), flush=True)
 
 

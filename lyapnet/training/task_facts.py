@@ -293,7 +293,8 @@ def _system_fact(problem: Problem) -> Fact:
         limits = f" in {controls}"
         if controls.fixed_limits is not None and controls.is_box:
             low, high = (side.expand(system.m) for side in controls.fixed_limits)
-            rows = zip(system.control_names, system.control_units, low.tolist(), high.tolist(), strict=True)
+            units = (unit if unit != "1" else "" for unit in system.control_units)
+            rows = zip(system.control_names, units, low.tolist(), high.tolist(), strict=True)
             limits = f" between {_format_vector(low)} and {_format_vector(high)}"
             if system.m <= NAMED_CONTROLS:
                 named = [f"{name} between {a:.3g} and {b:.3g} {unit}".rstrip() for name, unit, a, b in rows]

@@ -69,7 +69,7 @@ class Own(lyapnet.ControlAffineSystem):
         super().__init__()
         self.own_f, self.own_g = f, torch.tensor(g, dtype=torch.float64)
         self.state_names, self.state_units = [f"x{i}" for i in range(n)], [""] * n
-        self.control_names, self.control_units = [f"u{i}" for i in range(len(g[0]))], [""] * len(g[0])
+        self.control_names, self.control_units = [f"u{i}" for i in range(len(g[0]))], ["1"] * len(g[0])
 
     def f(self, x):
         return self.own_f(x)
@@ -151,6 +151,11 @@ def test_tasks_of_other_kinds(kind):
     assert bool(told["goal"].advice) == (kind in ("logarithm", "tight limits"))
     if kind == "root":
         assert "√(v² + ε²)" in told["modes"].advice
+
+
+def test_limits_of_a_control_without_unit():
+    told = facts_before_optima(config_of(controls={"lower": 0, "upper": 20}, target=[1, 0]), Parts(system=GRAVITY))
+    assert next(fact for fact in told if fact.name == "system").found.endswith(": u0 between 0 and 20")
 
 
 def test_a_cost_without_rest_has_no_goal():

@@ -216,7 +216,7 @@ def test_a_system_of_your_own(workplace, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 40, 20)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
-    (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
+    (source,) = [block for block in blocks("python") if "class Pendulum(ControlAffineSystem)" in block]
     assert len(source.strip().splitlines()) <= 24
     (config,) = [block for block in blocks("yaml") if "pendulum:Pendulum" in block and "system:" in block]
     (comparison,) = [block for block in blocks("yaml") if "comparison:" in block]

@@ -286,7 +286,8 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     claim = Region(states=[[-1], [1]], parameters={"gain": (2, 3)})
     certificate = certify(at, claim, budget=20, keep=path)
     assert certificate.verdict == "certified", "the nominal plant need not be in P"
-    assert "for each plant of this model with constant gain ∈ [2.0, 3.0]: no closed loop" in certificate.in_words()
+    about = "for each plant of this model with constant gain ∈ [2.0, 3.0] with u read at every t: no closed loop"
+    assert about in certificate.in_words()
     assert "u and V are those made for gain = 1.0: they do not depend" in certificate.in_words()
     assert "all converge to one equilibrium of their plant exponentially" in certificate.in_words()
     assert sum("for each p = (gain) ∈ P = [[2.0, 3.0]]" in line for line in certificate.in_formulas()) == 2

@@ -226,7 +226,7 @@ IMPOSSIBLE = {
     ),
     "system.name=nowhere:Thing": ("system.name", "nowhere"),
     "system.name=json:Nothing": ("system.name", "Nothing"),
-    "system.name=json:JSONDecoder": ("system.name", "ControlAffineSystem", "json:JSONDecoder"),
+    "system.name=json:JSONDecoder": ("system.name", "ControlSystem", "json:JSONDecoder"),
     "network.name=json:JSONDecoder & network.hidden=null": ("network.name", "json:JSONDecoder"),
     "system.name=hangar:Drone & system.parameters.mas=4": ("system.parameters.mas", "system.parameters.mass?"),
     "network.name=hangar:Bowl & network.activation=sin": ("network.activation", "hangar:Bowl"),

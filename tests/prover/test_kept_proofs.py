@@ -77,7 +77,7 @@ def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, t
     assert proof.counterexample == whole.counterexample
     assert proof.remaining_volume == whole.remaining_volume == 0
     assert whole.boxes > stopped[1].boxes > stopped[0].boxes
-    assert reports[0].boxes == stopped[1].boxes + 64, "it continues from the last state"
+    assert 0 < reports[0].boxes - stopped[1].boxes <= 64, "it continues from the last state, with a batch or its rest"
     assert reports[0].seconds > stopped[1].seconds
     assert [one.boxes for one in reports] == sorted(one.boxes for one in reports)
     assert reports[-1].remaining == 0

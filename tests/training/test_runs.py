@@ -885,16 +885,17 @@ def unstable(tmp_path):
         horizon={"steps": 40, "dt": 0.05},
         program={"name": "value", "trajectory_cost": 1},
         network={"name": "fcn", "hidden": [8, 8], "terminal": "exact"},
-        training={"iterations": 30, "batch_size": 6, "learning_rate": 0.3, "validate_every": 1},
+        training={"iterations": 30, "batch_size": 6, "learning_rate": 30, "validate_every": 1},
         evaluation={"validation_states": 6, "test_states": 6, "optimum": False},
         trainer={},
     )
 
 
-@pytest.mark.parametrize("validate_every", [1, 3])
-def test_divergence_is_one_line_and_keeps_the_last_good_checkpoint(validate_every, unstable):
+@pytest.mark.parametrize(("validate_every", "rate"), [(1, 30), (3, 0.3)])
+def test_divergence_is_one_line_and_keeps_the_last_good_checkpoint(validate_every, rate, unstable):
     """Whether a validation meets it first or a training step."""
-    status, _, errors = unstable.train(f"training.validate_every={validate_every}", prepare=without_figures)
+    changes = f"training.validate_every={validate_every}", f"training.learning_rate={rate}"
+    status, _, errors = unstable.train(*changes, prepare=without_figures)
     assert status == 1
     assert errors.count("\n") == 1, errors
     for text in ("Expected a", "Iteration", "returns did not help", "last.ckpt"):

@@ -10,14 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from lyapnet.base.errors import UsageError, did_you_mean, one_line
+from lyapnet.base.names import identifier, joined
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.references import costs_of_plant
-from lyapnet.task.models.robots import identifier
+from lyapnet.task.models.robots import FORCE, RATE, TORQUE
 from lyapnet.value.expansions import in_float64
 
-RATE = "_rate"  # what the name of a joint's rate ends with
-FORCES = ("_torque", "_force")  # of a joint without an actuator, as of a URDF
 AS_GOOD = 1.1  # a closed loop succeeds if it costs at most so much as with the model
 
 
@@ -97,11 +96,11 @@ def read_plant(path: Path, controller: Controller) -> Plant:
     actuators = names_of(kinds.mjOBJ_ACTUATOR, model.nu)
     states = {name: int(model.jnt_qposadr[j]) for name, j in joints.items()}
     rates = {f"{name}{RATE}": int(model.jnt_dofadr[j]) for name, j in joints.items()}
-    forces = {f"{name}{end}": int(model.jnt_dofadr[j]) for name, j in joints.items() for end in FORCES}
+    forces = {f"{name}{end}": int(model.jnt_dofadr[j]) for name, j in joints.items() for end in (TORQUE, FORCE)}
     plant = Plant(mujoco, model, [], [], [], [])
-    for i, name in enumerate(name.replace(" ", "_") for name in system.state_names):
+    for i, name in enumerate(joined(name) for name in system.state_names):
         _add(i, name, ((states, plant.positions), (rates, plant.rates)), f"states of the controller in {path.name}")
-    for i, name in enumerate(name.replace(" ", "_") for name in system.control_names):
+    for i, name in enumerate(joined(name) for name in system.control_names):
         _add(
             i,
             name,

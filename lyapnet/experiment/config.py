@@ -440,11 +440,11 @@ def _with_model(config: Config, folder: Path) -> Config:
     system = dataclasses.replace(system, file="", **{**read, "angles": system.angles or read["angles"]})
     controls = config.controls
     if limits and controls == ControlsConfig():
-        controls = dataclasses.replace(controls, lower=_open(limits[0]), upper=_open(limits[1]))
+        controls = dataclasses.replace(controls, lower=_none_if_infinite(limits[0]), upper=_none_if_infinite(limits[1]))
     return dataclasses.replace(config, system=system, controls=controls)
 
 
-def _open(limits: Sequence[float]) -> list[float | None] | None:
+def _none_if_infinite(limits: Sequence[float]) -> list[float | None] | None:
     """Limits with None where there is none; None if there are none at all."""
     given = [limit if math.isfinite(limit) else None for limit in limits]
     return None if all(limit is None for limit in given) else given

@@ -19,6 +19,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from lyapnet.base.errors import UsageError, did_you_mean, one_line
 from lyapnet.base.files import LARGEST_TEXT, read_file
+from lyapnet.base.names import joined
 
 _NUMBER = re.compile(r"\s*[-+]?[\d._]+(e[-+]?\d+)?\s*|.*\$\{.*", re.I)  # a number in quotes, or an interpolation
 
@@ -236,11 +237,6 @@ def _drop_replaced(content: Mapping[str, Any], later: Mapping[str, Any], schema:
             replaced = {joined(name) for name in other}
             found[f.name] = {name: one for name, one in value.items() if name in other or joined(name) not in replaced}
     return found
-
-
-def joined(name: Any) -> str:
-    """A name with _ for its spaces, by which names of a config are compared."""
-    return str(name).replace(" ", "_")
 
 
 def _require_numbers(key: str, value: Any, doc: str) -> None:

@@ -84,7 +84,8 @@ def test_a_heavier_plant_costs_more(controller, tmp_path):
     assert summary["cost_ratio"] > 1.05
 
 
-def test_what_mujoco_gives_up_has_no_cost(controller, tmp_path):
+def test_what_mujoco_gives_up_has_no_cost(controller, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
     text = PENDULUM.format(mass=1, more="").replace('damping="0.1"', 'damping="0.1" stiffness="-1e9"')
     summary = measured(controller, plant(tmp_path, text)).summary()
     assert summary["finite_fraction"] == summary["as_good_fraction"] == 0

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.experiment.schema import joined
+from lyapnet.base.names import joined
 from lyapnet.task.systems import ControlSystem
 
 Value = TypeVar("Value")

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.names import joined
 from lyapnet.base.types import ControlMatrix, State
 from lyapnet.experiment.assembly.classes import Parts, section
 from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
 from lyapnet.experiment.assembly.weights import named, weighted_matrices, weights_among, weights_of, with_weights
 from lyapnet.experiment.config import Config
-from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import Cost, MadeOfAnother, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
 from lyapnet.task.problem import Problem

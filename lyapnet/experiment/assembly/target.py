@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
+from lyapnet.base.names import joined
 from lyapnet.experiment.assembly.entries import by_state, repeated, require_length
 from lyapnet.experiment.config import Config, ConstraintsConfig
-from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import Cost, TargetCost
 from lyapnet.task.operating_points import OperatingPoint, OperatingPoints
 from lyapnet.task.sets import Box, ControlSet

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.names import joined
 from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import repeated, rows
 from lyapnet.experiment.config import CostConfig
-from lyapnet.experiment.schema import joined
 from lyapnet.task.cost import COSTS, MATRICES, Cost, DiagonalWeights, MadeOfAnother, QuadraticCost
 from lyapnet.task.systems import ControlSystem
 

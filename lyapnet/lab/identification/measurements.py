@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 
 from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.names import joined
 from lyapnet.base.types import State
 from lyapnet.experiment.csv_columns import read_columns
-from lyapnet.experiment.schema import joined
 from lyapnet.lab.identification.units import factor, name_and_unit
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.systems import ControlSystem

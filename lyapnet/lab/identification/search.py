@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.names import joined
 from lyapnet.experiment.assembly.entries import repeated
-from lyapnet.experiment.schema import joined
 from lyapnet.lab.identification.estimation import Fit, Point, Solution
 from lyapnet.lab.identification.measurements import Measurements
 from lyapnet.lab.identification.shooting import SEGMENT, Shooting

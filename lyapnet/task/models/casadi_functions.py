@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.names import joined
 
 POINTS = 8  # random points at which equations are compared with the function
 
@@ -184,7 +185,7 @@ def _names_of(function: Any, i: int, given: Sequence[str]) -> list[str]:
                 f"Expected {count} names for {name} of {function.name()}, got {len(given)} ({', '.join(given)}); name "
                 "each in its order."
             )
-        return [each.replace(" ", "_") for each in given]
+        return [joined(each) for each in given]
     symbols = [str(each) for each in function.sx_in(i).elements()]
     usable = all(_is_name(each) for each in symbols) and len(set(symbols)) == count
     if usable and not all(each.startswith(f"i{i}") for each in symbols):  # the names that expand() gives

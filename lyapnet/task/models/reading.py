@@ -27,11 +27,11 @@ _CHILD = (
 
 
 def read_model(path: Path, kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What a reader of READERS says of a file.
+    """The fields of the Model in a file, by name.
 
     Args:
-        kind: casadi or urdf.
-        options: further arguments of the reader.
+        kind: of KINDS.
+        options: names of states and controls in the place of the model's own.
 
     Raises:
         UsageError: no such file, a library is missing, or the file holds something else.
@@ -69,7 +69,7 @@ def child() -> None:
     try:
         reader = _reader(asked["kind"])
         _give_up_files()
-        answer = reader(content, asked["name"], **asked["options"])
+        answer = reader(content, **asked["options"])
     except UsageError as error:
         answer = {"error": str(error)}
     except Exception as error:  # of many kinds: the file is a stranger's
@@ -90,14 +90,14 @@ def _reader(kind: str) -> Any:
 
             for name in LINEAR_SOLVERS:
                 casadi.has_linsol(name)  # loads it
-            return lambda content, name, **options: model_of_function(
+            return lambda content, **options: model_of_function(
                 function_of_text(casadi, content.decode("ascii")), **options
             )._asdict()
         from lyapnet.task.models import robots
 
         read = robots.model_of_urdf if kind == "urdf" else robots.model_of_mjcf
         read(robots.SMALLEST_URDF if kind == "urdf" else robots.SMALLEST_MJCF)  # loads what is loaded when it is used
-        return lambda content, name, **options: read(content, **options)._asdict()
+        return lambda content, **options: read(content, **options)._asdict()
     except ImportError as error:
         raise UsageError(
             f"Expected {error.name} for a {kind} model, got none; install it by pip install 'lyapnet[{EXTRAS[kind]}]'."

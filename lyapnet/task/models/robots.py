@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lyapnet.base.errors import UsageError
+from lyapnet.base.names import identifier
 from lyapnet.task.models.casadi_functions import Model, model_of_function
 
 GRAVITY = 9.81  # m/s², in the direction −z, for URDF, which names none
+RATE, TORQUE, FORCE = "_rate", "_torque", "_force"  # what names end with of a joint's rate, and of what moves it
 SLIDING = 0.05  # rad/s or m/s in which dry friction turns: its force is −friction · tanh(speed / SLIDING)
 TOLERANCE = 1e-9  # largest relative difference from MuJoCo's accelerations
 
@@ -90,10 +92,10 @@ def model_of_mjcf(content: bytes, states: Sequence[str] = (), controls: Sequence
 
 def _model(robot: Robot, states: Sequence[str], controls: Sequence[str]) -> Model:
     joints = robot.joints
-    own = [name for form in ("{}", "{}_rate") for name in (form.format(identifier(each.name)) for each in joints)]
+    own = [f"{identifier(each.name)}{end}" for end in ("", RATE) for each in joints]
     motors = [identifier(each.name) for each in robot.actuators]
     taken = {*own}
-    motors = [name if name not in taken else f"{name}_{'force' if joints[each.joint].slides else 'torque'}"
+    motors = [name if name not in taken else f"{name}{FORCE if joints[each.joint].slides else TORQUE}"
               for name, each in zip(motors, robot.actuators, strict=True)]  # fmt: skip
     function = _function(robot)
     model = model_of_function(function, list(states) or own, list(controls) or motors)
@@ -104,12 +106,6 @@ def _model(robot: Robot, states: Sequence[str], controls: Sequence[str]) -> Mode
         angles=[name for name, each in zip(model.states, joints, strict=False) if not each.slides],
         limits=[[each.lower for each in robot.actuators], [each.upper for each in robot.actuators]],
     )
-
-
-def identifier(name: str) -> str:
-    """A name of letters, digits and _."""
-    text = re.sub(r"\W", "_", name)
-    return text if text[:1].isalpha() else f"joint_{text}"
 
 
 def _function(robot: Robot, friction: bool = True) -> Any:

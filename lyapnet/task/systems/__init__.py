@@ -3,6 +3,7 @@
 from collections import ChainMap
 from collections.abc import Mapping
 
+from lyapnet.task.models.reading import KINDS
 from lyapnet.task.systems.acrobot import Acrobot
 from lyapnet.task.systems.base import (
     ControlAffineSystem,
@@ -45,7 +46,7 @@ SYSTEMS: dict[str, type[ControlSystem]] = {
     "kinematic_bicycle": KinematicBicycle,
     "glider": Glider,
 }
-BY_EQUATIONS = ("equations", "casadi", "urdf", "mjcf")  # equations in a config, or read from a model's file
+BY_EQUATIONS = ("equations", *KINDS)  # equations in a config, or read from a model's file
 NAMED_SYSTEMS: Mapping[str, type[ControlSystem]] = ChainMap(SYSTEMS, dict.fromkeys(BY_EQUATIONS, EquationSystem))
 
 __all__ = [

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.names import joined
 from lyapnet.base.types import Control, InputMatrix, State
 from lyapnet.task.systems.base import ControlSystem
 from lyapnet.task.systems.formulas import Formulas, Number
@@ -35,7 +35,7 @@ class Definition(NamedTuple):
     @property
     def names(self) -> list[str]:
         """The names of states, controls and parameters, as equations write them."""
-        return [written(name) for name in (*dict(self.states), *dict(self.controls), *self.parameters)]
+        return [joined(name) for name in (*dict(self.states), *dict(self.controls), *self.parameters)]
 
 
 class EquationSystem(ControlSystem):
@@ -48,33 +48,28 @@ class EquationSystem(ControlSystem):
         parameters: p by name, in SI units.
 
     Raises:
-        UsageError: the equations cannot be read, a name in them is not known, or a state has none.
+        UsageError: a parameter is no number, or an angle is no state.
     """
 
     definition: Definition
+    formulas: Formulas
 
     def __init__(self, **parameters: float):
         super().__init__()
         definition = self.definition
-        for kind, entries in (("states", definition.states), ("controls", definition.controls)):
-            if not entries:
-                raise UsageError(f"Expected system.{kind} as {{name: unit}} for the equations, got none; name them.")
-        self.state_names, self.state_units = map(list, zip(*definition.states, strict=True))
-        self.control_names, self.control_units = map(list, zip(*definition.controls, strict=True))
-        self.angles = [_index_of(name, self.state_names) for name in definition.angles]
-        self.formulas = Formulas(
-            definition.equations, definition.names, [f"der({written(name)})" for name in self.state_names]
-        )
+        self.state_names: list[str] = [name for name, _ in definition.states]
+        self.state_units: list[str] = [unit for _, unit in definition.states]
+        self.control_names: list[str] = [name for name, _ in definition.controls]
+        self.control_units: list[str] = [unit for _, unit in definition.controls]
+        self.angles: list[int] = [_index_of(name, self.state_names) for name in definition.angles]
         for name in definition.parameters:
             if isinstance(parameters[name], bool) or not isinstance(parameters[name], int | float):
                 raise UsageError(f"Expected a number for system.parameters.{name}, got {parameters[name]!r}; give one.")
             setattr(self, self.attribute_of(name), parameters[name])
-        self.is_affine = True
-        self.is_affine = self._slopes(torch.zeros(self.n)) is not None
 
     @property
     def affine(self) -> bool:
-        return self.is_affine
+        return self.formulas.affine
 
     @property
     def title(self) -> str:
@@ -88,20 +83,15 @@ class EquationSystem(ControlSystem):
         return torch.stack(self.formulas(self._values(x, u.unbind(-1)), x[..., 0]), -1)
 
     def f(self, x: State) -> State:
-        if not self.is_affine:
+        if not self.affine:
             return super().f(x)
         return torch.stack(self.formulas(self._values(x, [0.0] * self.m), x[..., 0]), -1)
 
     def g(self, x: State) -> InputMatrix:
-        slopes = self._slopes(x)
-        return super().g(x) if slopes is None else torch.stack([torch.stack(row, -1) for row in slopes], -2)
-
-    def _slopes(self, x: State) -> list[list[Tensor]] | None:
-        """The entries of g; None if the operations of the equations are not affine in u."""
-        if not self.is_affine:
-            return None
-        controls = [written(name) for name in self.control_names]
-        return self.formulas.slopes(self._values(x, [0.0] * self.m), controls, x[..., 0])
+        if not self.affine:
+            return super().g(x)
+        rows = self.formulas.slopes(self._values(x, [0.0] * self.m), x[..., 0])
+        return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
     def _values(self, x: State, u: Sequence[Number]) -> dict[str, Number]:
         """The numbers that the equations name."""
@@ -115,8 +105,21 @@ class EquationSystem(ControlSystem):
 
 @functools.cache
 def system_class(definition: Definition) -> type[EquationSystem]:
-    """The class of the systems with these equations; its constructor takes their parameters by name."""
-    cls = type("EquationSystem", (EquationSystem,), {"definition": definition, "__doc__": EquationSystem.__doc__})
+    """The class of the systems with these equations, read once; its constructor takes their parameters by name.
+
+    Raises:
+        UsageError: there are no states or controls, the equations cannot be read, or a state has none.
+    """
+    for kind, entries in (("states", definition.states), ("controls", definition.controls)):
+        if not entries:
+            raise UsageError(f"Expected system.{kind} as {{name: unit}} for the equations, got none; name them.")
+    results = [f"der({joined(name)})" for name, _ in definition.states]
+    controls = [joined(name) for name, _ in definition.controls]
+    own = {
+        "definition": definition, "__doc__": EquationSystem.__doc__,
+        "formulas": Formulas(definition.equations, definition.names, results, controls),
+    }  # fmt: skip
+    cls = type("EquationSystem", (EquationSystem,), own)
     keyword = inspect.Parameter.KEYWORD_ONLY
     cls.__signature__ = inspect.Signature(  # pyright: ignore[reportAttributeAccessIssue]
         [inspect.Parameter(name, keyword, annotation=float) for name in definition.parameters]
@@ -131,11 +134,6 @@ def defined(
     """The class of the systems with these equations, from names and units in mappings."""
     named = [tuple((name, unit or "") for name, unit in entries.items()) for entries in (states, controls)]
     return system_class(Definition(equations, named[0], named[1], tuple(parameters), tuple(angles), title))
-
-
-def written(name: str) -> str:
-    """A name as equations write it, with _ for its spaces."""
-    return name.replace(" ", "_")
 
 
 def _without_init(definition: Definition) -> EquationSystem:

@@ -82,10 +82,7 @@ _LOGICAL: dict[str, Operation] = {
     "or": Operation(torch.logical_or, np.logical_or, 2),
     "not": Operation(torch.logical_not, np.logical_not, 1),
 }
-_OPERATIONS: dict[str, Operation] = {
-    **FUNCTIONS,
-    **_COMPARISONS,
-    **_LOGICAL,
+_ARITHMETIC: dict[str, Operation] = {
     "+": Operation(operator.add, np.add, 2),
     "-": Operation(operator.sub, np.subtract, 2),
     "*": Operation(operator.mul, np.multiply, 2),
@@ -93,6 +90,7 @@ _OPERATIONS: dict[str, Operation] = {
     "**": Operation(operator.pow, np.power, 2),
     "negative": Operation(operator.neg, np.negative),
 }
+_OPERATIONS: dict[str, Operation] = {**FUNCTIONS, **_COMPARISONS, **_LOGICAL, **_ARITHMETIC}
 
 
 class Instruction(NamedTuple):
@@ -109,14 +107,19 @@ class Formulas:
         text: the lines of assignments.
         names: the numbers that are given: states, controls and parameters.
         results: names that the text has to define, `der(name)` included, in the order of the results.
+        controls: those of the names in which the results may be affine.
         where: what the text is called in messages.
 
     Raises:
         UsageError: a line is no such assignment, or a name is unknown, or missing, or assigned twice.
     """
 
-    def __init__(self, text: str, names: Sequence[str], results: Sequence[str], where: str = "equations"):
-        self.where, self.names = where, tuple(names)
+    def __init__(
+        self, text: str, names: Sequence[str], results: Sequence[str], controls: Sequence[str],
+        where: str = "equations",
+    ):  # fmt: skip
+        self.where: str = where
+        self.names: tuple[str, ...] = tuple(names)
         self.constants: dict[int, float] = {}
         self.instructions: dict[int, Instruction] = {}
         self._known: dict[Any, int] = {}
@@ -124,8 +127,11 @@ class Formulas:
         self._places = {name: place for place, name in enumerate(names)}
         self._size = len(self._places)
         self._read(text, results)
-        self.results = [self._places[name] for name in results]
+        self.results: list[int] = [self._places[name] for name in results]
         del self._known, self._places
+        self.controls: tuple[str, ...] = tuple(controls)
+        self.affine: bool
+        self._moved, self._factors, self.affine = self._dependence()
 
     def __call__(self, values: Mapping[str, Number], like: Tensor, only: Collection[int] | None = None) -> list[Tensor]:
         """The results as tensors (*batch,), at given numbers.
@@ -139,32 +145,36 @@ class Formulas:
         found = self._computed(values, chosen, like)
         return [_filled(found[place], like) for place in chosen]
 
-    def slopes(self, values: Mapping[str, Number], controls: Sequence[str], like: Tensor) -> list[list[Tensor]] | None:
-        """[b_1, …, b_m] of each result c + Σ_j b_j u_j; None if one is not affine in u.
+    def slopes(self, values: Mapping[str, Number], like: Tensor) -> list[list[Tensor]]:
+        """[b_1, …, b_m] of each result c + Σ_j b_j u_j, if they are affine; what b needs alone is computed."""
+        slopes: dict[int, dict[int, Number]] = {self.names.index(u): {j: 1.0} for j, u in enumerate(self.controls)}
+        found = self._computed({k: v for k, v in values.items() if k not in self.controls}, self._factors, like)
+        for place in self._moved:
+            operation, operands = self.instructions[place]
+            slopes[place] = _slopes(
+                operation, [slopes.get(k, {}) for k in operands], [found.get(k, 0.0) for k in operands], like
+            )
+        columns = range(len(self.controls))
+        return [[_filled(slopes.get(place, {}).get(j, 0.0), like) for j in columns] for place in self.results]
 
-        Whether they are is decided by the operations alone, the same for all values. What b needs alone is computed.
+    def _dependence(self) -> tuple[list[int], set[int], bool]:
+        """The instructions that depend on u, the places that scale their slopes, and whether all results are affine.
+
+        The operations alone decide, the same for all values.
         """
-        slopes: dict[int, dict[int, Number]] = {self.names.index(name): {j: 1.0} for j, name in enumerate(controls)}
-        moved, factors = list[int](), set[int]()  # instructions that depend on u, and what these slopes are scaled by
-        depends = set(slopes)
+        moved, factors = list[int](), set[int]()
+        depends = {self.names.index(u) for u in self.controls}
         for place in self._needed(self.results):
             operation, operands = self.instructions[place]
             if depends.isdisjoint(operands):
                 continue
             scales = _factors(operation, [k in depends for k in operands])
             if scales is None:
-                return None
+                return [], set(), False
             factors.update(operands[i] for i in scales)
             depends.add(place)
             moved.append(place)
-        found = self._computed({k: v for k, v in values.items() if k not in controls}, factors, like)
-        for place in moved:
-            operation, operands = self.instructions[place]
-            slopes[place] = _slopes(
-                operation, [slopes.get(k, {}) for k in operands], [found.get(k, 0.0) for k in operands], like
-            )
-        columns = range(len(controls))
-        return [[_filled(slopes.get(place, {}).get(j, 0.0), like) for j in columns] for place in self.results]
+        return moved, factors, True
 
     def _computed(self, values: Mapping[str, Number], places: Iterable[int], like: Tensor) -> dict[int, Number]:
         """The numbers at some places, and at those on which they depend."""
@@ -314,9 +324,7 @@ def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Numbe
     if operation == "**" and isinstance(operands[1], float):
         exponent = operands[1]
         return _as_number(operands[0], like) ** (int(exponent) if exponent.is_integer() else exponent)
-    if operation in ("+", "-", "*", "/", "**", "negative"):
-        return _OPERATIONS[operation].of_tensors(*(_as_number(each, like) for each in operands))
-    if operation in _COMPARISONS:
+    if operation in _ARITHMETIC or operation in _COMPARISONS:
         return _OPERATIONS[operation].of_tensors(*(_as_number(each, like) for each in operands))
     if operation in _LOGICAL:
         return _OPERATIONS[operation].of_tensors(*(_as_condition(each, like) for each in operands))

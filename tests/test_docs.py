@@ -71,7 +71,7 @@ def test_links_resolve(page):
 
 def test_a_wrong_anchor_is_found():
     assert "certify" not in anchors(README)
-    assert "how-the-bounds-were-examined" in anchors(ROOT / "docs" / "certify.md")
+    assert "how-the-bounds-were-examined" in anchors(ROOT / "docs" / "proofs.md")
 
 
 def test_every_page_is_reached_from_the_readme():

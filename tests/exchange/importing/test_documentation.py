@@ -1,4 +1,4 @@
-"""The example of docs/certify.md: two networks trained in torch alone, exported, and certified."""
+"""The example of docs/networks_of_others.md: two networks trained in torch alone, exported, and certified."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from lyapnet.cli import main
 from tests.pages import ROOT, blocks
 
 pytest.importorskip("onnxruntime")
-PAGE = ROOT / "docs" / "certify.md"
+PAGE = ROOT / "docs" / "networks_of_others.md"
 STEPS = "steps = 3000"
 
 

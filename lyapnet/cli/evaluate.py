@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimator_of, of_a_controller
+from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, estimator_of, of_a_controller
 
 if TYPE_CHECKING:
     from lyapnet.controller.controller import Controller
@@ -46,6 +46,7 @@ def evaluate(
         str, typer.Option(help="The estimator, where outputs are measured: ekf or ukf, Kalman filters.")
     ] = "ekf",
     deviation: FirstDeviation = None,
+    delay: Delay = None,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -64,7 +65,7 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = given.load()
-    filtered = estimator_of(controller, outputs or [], estimator, deviation)
+    filtered = estimator_of(controller, outputs or [], estimator, deviation, delay)
     count = min(samples, 64)
     simulated = None if plant is None else read_plant(plant, controller)
     if until is not None:

@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, FirstDeviation, Given, Measured, estimator_of, of_a_controller
+from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, estimator_of, of_a_controller
 
 
 @of_a_controller
@@ -27,6 +27,7 @@ def export(
     ] = None,
     outputs: Measured = None,
     deviation: FirstDeviation = None,
+    delay: Delay = None,
     certified: Annotated[
         Path | None,
         typer.Option(
@@ -45,15 +46,17 @@ def export(
     """
     from lyapnet.exchange.export import export as write
 
-    if estimator is None and (outputs or deviation):
-        raise UsageError("Expected --estimator with --outputs and --initial-deviation, got none; add --estimator ekf.")
+    if estimator is None and (outputs or deviation or delay is not None):
+        raise UsageError(
+            "Expected --estimator with --outputs, --initial-deviation and --delay, got none; add --estimator ekf."
+        )
     if certified is not None and (to != "c" or estimator is not None):
         got = f"--to {to}" if to != "c" else "--estimator"
         raise UsageError(f"Expected --certified with --to c and the law alone, got {got}; leave one of them out.")
     controller = given.load() if beyond is None else given.load().continued(beyond)
     exported = controller
     if estimator is not None:
-        exported = estimator_of(controller, outputs or [], estimator, deviation)
+        exported = estimator_of(controller, outputs or [], estimator, deviation, delay)
         if exported is None:
             raise UsageError("Expected --outputs, or outputs in the run's YAML, with --estimator, got none; name them.")
     given.report("writing and verifying")

@@ -44,6 +44,10 @@ FirstDeviation = Annotated[
         metavar="SIGMA",
     ),
 ]
+Delay = Annotated[
+    int | None,
+    typer.Option(help="With an estimator: steps of Δt after its readings at which a control acts.", metavar="STEPS"),
+]
 OWN = {
     "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",
     "constraints": "constraints", "program": "a program",
@@ -306,15 +310,17 @@ def member_of(controller: Any, at: list[str]) -> Any:
     return controller.with_(**parameters)
 
 
-def estimator_of(controller: Any, outputs: list[str], kind: str, deviation: list[float] | None) -> Any:
+def estimator_of(
+    controller: Any, outputs: list[str], kind: str, deviation: list[float] | None, delay: int | None
+) -> Any:
     """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
     if not outputs:
         if controller.measures_outputs:
-            return controller.with_estimator(kind, initial_deviation=deviation or None)
-        if kind != "ekf" or deviation:
+            return controller.with_estimator(kind, initial_deviation=deviation or None, delay=delay)
+        if kind != "ekf" or deviation or delay is not None:
             raise UsageError(
-                "Expected --outputs, or outputs in the run's YAML, with --estimator and --initial-deviation, got none; "
-                "name what is measured: --outputs STATE=SIGMA."
+                "Expected --outputs, or outputs in the run's YAML, with --estimator, --initial-deviation and --delay, "
+                "got none; name what is measured: --outputs STATE=SIGMA."
             )
         return None
     named = [text.rpartition("=") for text in outputs]
@@ -327,4 +333,6 @@ def estimator_of(controller: Any, outputs: list[str], kind: str, deviation: list
     states = [name for name, _, _ in named if name]
     if states and len(states) < len(named):
         raise UsageError(f"Expected --outputs STATE=SIGMA for each, got {' '.join(outputs)}; name the state of each.")
-    return controller.with_estimator(kind, measure=states, noise=noise, initial_deviation=deviation or None)
+    return controller.with_estimator(
+        kind, measure=states, noise=noise, initial_deviation=deviation or None, delay=delay
+    )

@@ -287,6 +287,7 @@ class Controller:
         process_noise: Mapping[str, float] | None = None,
         input_disturbances: Mapping[str, float] | None = None,
         initial_deviation: Sequence[float] | float | None = None,
+        delay: int | None = None,
     ) -> OutputFeedback:
         """The controller for states that are not measured: y ↦ u(t, x̂) with a Kalman filter; see OutputFeedback.
 
@@ -300,6 +301,7 @@ class Controller:
             input_disturbances: constant disturbances of controls, by name, that are estimated and taken off; each with
                 the random walk assumed of it, in its unit per √s.
             initial_deviation: standard deviation of the first estimate of each state.
+            delay: after how many steps of Δt a control acts, for a late reading, computation or actuator.
 
         Raises:
             UsageError: there are no outputs, or they do not fit the system.
@@ -315,6 +317,7 @@ class Controller:
             "process_noise": None if process_noise is None else dict(process_noise),
             "input_disturbances": None if input_disturbances is None else dict(input_disturbances),
             "initial_deviation": _listed(initial_deviation),
+            "delay": delay,
         }
         known = OutputsConfig() if self._config is None else self._config.outputs
         section = replace(known, **{key: value for key, value in given.items() if value is not None})
@@ -329,7 +332,7 @@ class Controller:
             )
         return OutputFeedback(
             self.law, problem_of_estimator(section, problem), parts.outputs, kind, parts.drift, parts.deviation,
-            around_state=section.initial_deviation is not None, controller=self,
+            section.delay, around_state=section.initial_deviation is not None, controller=self,
         )  # fmt: skip
 
     def continued(self, beyond: str) -> "Controller":

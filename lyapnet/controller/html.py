@@ -51,6 +51,8 @@ def loop_as_html(loop: Any) -> str:
         ("estimator", [f"{type(loop.filter).__name__} of {', '.join(loop.problem.system.state_names)}"]),
         ("time", [f"t = {_number(loop.t)} s, a call of step(y) in each {_number(loop.problem.horizon.dt)} s"]),
     ]
+    if loop.delay:
+        rows.append(("dead time", [f"{loop.delay} steps from readings to the control they lead to"]))
     return _table(type(loop).__name__, rows)
 
 

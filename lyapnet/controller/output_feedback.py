@@ -30,6 +30,10 @@ class OutputFeedback:
     shape of the first readings, has an estimate of its own; computations are in float64. Disturbances d of controls
     that are estimated too are taken off: the control is u(t, x̂) − d̂, within its limits.
 
+    With a delay of d steps a control acts from d Δt after its readings on. Which controls act until then is known, so
+    that it is u(t_k + dΔt, x̂) at the state x̂ that the model predicts for that time; at first u at rest acts. For a
+    plant like the model that is the best law from dΔt on.
+
     Args:
         law: u(t, x) with its V, for all t ≥ 0.
         problem: the steps that the estimator predicts with. Its states are those of the law, or (x, p) with parameters
@@ -38,6 +42,7 @@ class OutputFeedback:
         kind: ekf, the extended Kalman filter; or ukf, the unscented one.
         drift: see KalmanFilter.
         deviation: standard deviation of the first estimate, (n,).
+        delay: d, after how many steps a control acts.
         around_state: whether evaluations draw the first estimate around x₀ by this deviation, or take the centre of X₀.
         controller: the Controller whose law it is, for exports.
 
@@ -49,6 +54,7 @@ class OutputFeedback:
     kind: str
     outputs: Outputs
     deviation: Deviations
+    delay: int
     around_state: bool
     controller: Any
     problem: Problem
@@ -59,11 +65,11 @@ class OutputFeedback:
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
-        deviation: Deviations, around_state: bool = False, controller: Any = None,
+        deviation: Deviations, delay: int = 0, around_state: bool = False, controller: Any = None,
     ):  # fmt: skip
         if kind not in FILTERS:
             raise UsageError(f"Expected an estimator as one of {', '.join(FILTERS)}, got {kind!r}; choose one of them.")
-        self.law, self.kind, self.outputs = law, kind, outputs
+        self.law, self.kind, self.outputs, self.delay = law, kind, outputs, delay
         self.deviation, self.around_state, self.controller = deviation, around_state, controller
         self.state_of_law = problem.initial_states.lower[: law.system.n]
         self.problem = copied(problem).requires_grad_(False)  # in float64, on the CPU
@@ -106,7 +112,8 @@ class OutputFeedback:
             )
         if not (bool(first.isfinite().all()) and math.isfinite(t)):
             raise ValueError(f"Expected finite x_hat and t, got {first.tolist()} and {t}; give numbers.")
-        self._belief, self._u, self._t, self._began = Belief(first, covariance), None, float(t), 0.0
+        self._belief, self._t, self._began = Belief(first, covariance), float(t), 0.0
+        self._due: Tensor | None = None  # the controls of this interval and of the d after it, (d + 1, *batch, m)
         self._like: Any = x_hat if x_hat is not None else np.empty(0)
 
     def middle_estimate(self) -> State:
@@ -172,10 +179,12 @@ class OutputFeedback:
     def step(self, y: Any, applied: Any = None, **settings: Any) -> Any:
         """u(t, x̂) (*batch, m) after readings y (*batch, p), within the limits of the controls.
 
+        It acts at once, or `delay` steps later; `acting` is the control that acts until the next call.
+
         Args:
             y: the readings; NaN for one that is missing.
-            applied: the control that the plant received since the last call, if it was not the one returned; of no
-                meaning in the first call.
+            applied: the control that the plant received since the last call, if it was not `acting`; of no meaning in
+                the first call.
             settings: of a family: parameters that the plant does not know, such as a target, from now on; each a number
                 or (*batch,). Those that are left out stay as they are, at first in the middle of their ranges. Where
                 one changes the horizon begins anew.
@@ -186,11 +195,23 @@ class OutputFeedback:
         self.observe(y, applied)
         if settings:
             self._change(settings)
-        like = self.state_of_law
-        u = self.law(like.new_tensor(self._t - self._began), self._belief.x[..., : len(like)].to(like)).detach()
-        u = self.without_disturbances(u, self._belief.x)
-        self._u = u.double().cpu()
+        if self._due is None:
+            at_rest = self._controls.project(self.problem.rest.to(self._belief.x))
+            self._due = at_rest.expand(self.delay + 1, *self._belief.x.shape[:-1], -1)
+        like, x = self.state_of_law, self._belief.x
+        for u in self._due[:-1]:
+            x = self.problem.step(x, u)[0]
+        t = self._t - self._began + self.delay * self.problem.horizon.dt
+        u = self.without_disturbances(self.law(like.new_tensor(t), x[..., : len(like)].to(like)).detach(), x)
+        self._due = torch.cat([self._due[:-1], u.double().cpu()[None]])
         return in_form_of(y, u)
+
+    @property
+    def acting(self) -> Any:
+        """The control (*batch, m) that acts until the next call of `step`, once it was called."""
+        if self._due is None:
+            raise ValueError("Expected acting after a call of step, got none since the reset; call step first.")
+        return in_form_of(self._like, self._due[0])
 
     def without_disturbances(self, u: Control, x: State) -> Control:
         """u − d̂ within the limits, for the estimate x (*batch, n); u where no disturbance is estimated."""
@@ -208,8 +229,8 @@ class OutputFeedback:
         """The estimate after readings y, without a control; see `step`."""
         readings, p = _float64(y), self.outputs.count
         batch = tuple(self._belief.x.shape[:-1])
-        if readings.ndim < 1 or readings.shape[-1] != p or (self._u is not None and readings.shape[:-1] != batch):
-            expected = f"(*batch, {p})" if self._u is None else str((*batch, p))
+        if readings.ndim < 1 or readings.shape[-1] != p or (self._due is not None and readings.shape[:-1] != batch):
+            expected = f"(*batch, {p})" if self._due is None else str((*batch, p))
             raise ValueError(
                 f"Expected y of shape {expected}, got {tuple(readings.shape)}; the last axis holds "
                 f"{', '.join(self.outputs.names)}."
@@ -217,10 +238,11 @@ class OutputFeedback:
         if bool(readings.isinf().any()):
             raise ValueError("Expected finite readings, got an infinite one; write NaN for one that is missing.")
         self._like = y
-        if self._u is None:
+        if self._due is None:
             belief = self._first_of(tuple(readings.shape[:-1]))
         else:
-            u = self._u if applied is None else self._applied(applied, self._u)
+            u = self._due[0] if applied is None else self._applied(applied, self._due[0])
+            self._due = torch.cat([self._due[1:], self._due[-1:]])  # without a new one the last goes on
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
         self._belief = self.corrected(belief, readings)
 
@@ -252,7 +274,7 @@ class OutputFeedback:
                 low, high = (10**low, 10**high) if weight else (low, high)
                 raise ValueError(f"Expected {name} from {low:g} to {high:g}, for which V was trained, got {value}.")
             x[..., i] = number
-        if self._u is not None and not torch.equal(x, self._belief.x):
+        if self._due is not None and not torch.equal(x, self._belief.x):
             self._began = self._t
         self._belief = self._belief._replace(x=x)
 

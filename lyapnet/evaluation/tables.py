@@ -138,13 +138,14 @@ def _estimator_rows(result: dict[str, Any]) -> dict[str, str]:
     if (found := result.get("outputs")) is None:
         return {}
     read = ", ".join(f"{name} ± {noise:.3g}" for name, noise in found["readings"].items())
+    late = f", each control {found['delay']} steps late" if found["delay"] else ""
     (low, high), nees = found["nees_band"], (found["nees"], found["nees_half_width"])
     ratio, half_width = found["cost_ratio"], found["half_width"]
     known, cost = (
         "not finite" if each is None else f"{each:.5g}" for each in (found["known_cost_mean"], found["cost_mean"])
     )
     return {
-        f"with {found['estimator']} from {read}": f"{found['runs']} runs",
+        f"with {found['estimator']} from {read}{late}": f"{found['runs']} runs",
         "… cost J, mean: state known, estimated": f"{known}, {cost}",
         "… their ratio, with its 95 % interval": "–" if ratio is None else f"{ratio:.4f}{_plus_minus(half_width)}",
         "… runs lost, which cost half more than with the state known": f"{found['lost_fraction']:.2%}",

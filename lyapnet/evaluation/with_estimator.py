@@ -60,6 +60,7 @@ class EstimatorMeasures(NamedTuple):
     nees_half_width: float  # of its 95 % interval, from the spread of the runs
     nees_band: tuple[float, float]  # that contains the mean over the runs at a step with 95 % if P is right
     nees_inside: float  # share of the steps at which that mean is within the band
+    delay: int  # steps after its readings at which a control acts
     outlier_fraction: float  # share of runs with (x − x̂)ᵀP⁻¹(x − x̂) at T above what 99.9 % have if P is right
     errors: dict[str, tuple[float, float]]  # state ↦ (its root mean square error at T, √P there), in its unit
 
@@ -96,9 +97,9 @@ def loops_with_estimator(controller: Controller, estimator: OutputFeedback, x0: 
 
     def law(k: int, z: State) -> Tensor:
         readings.append(outputs.draw(z, draws))
-        u = estimator.step(readings[-1])
+        estimator.step(readings[-1])
         beliefs.append(estimator.belief)
-        return u.to(z)
+        return estimator.acting.to(z)
 
     path = path_under(problem, law, z0, increments)
     readings.append(outputs.draw(path.x[-1], draws))
@@ -133,7 +134,7 @@ def measure_with_estimator(loops: EstimatedLoops, estimator: OutputFeedback) -> 
         dict(zip(outputs.names, outputs.noise.tolist(), strict=True)),
         float(known.mean()), float(J.mean()), ratio, half_width, float(lost.double().mean()),
         float(each.mean()), half_width_of_mean(each[:, None]), (low, high), float(inside.double().mean()),
-        float((~(n * nees[-1] <= float(chi2.ppf(RARE, n)))).double().mean()),
+        estimator.delay, float((~(n * nees[-1] <= float(chi2.ppf(RARE, n)))).double().mean()),
         dict(zip(labels, zip(rms.tolist(), deviation, strict=True), strict=True)),
     )  # fmt: skip
 

@@ -205,6 +205,7 @@ class OutputsConfig:
     initial_deviation: list[float] | None = setting(
         None, "Standard deviation of the first estimate of each state; null: that of a uniform x₀ in X₀.", above=0
     )
+    delay: int = setting(0, "Steps of Δt after its readings at which a control acts.", at_least=0)
 
 
 @dataclass

@@ -81,6 +81,54 @@ def test_each_call_predicts_by_a_step_under_the_control_that_was_applied():
         assert_close(torch.from_numpy(feedback.x_hat), expected)
 
 
+@pytest.mark.parametrize("delay", [1, 4])
+def test_after_a_delay_the_loop_is_the_one_without_from_where_the_plant_then_is(delay):
+    """Of a plant like the model: rest acts for the delay, and then the law acts on the state at its own time."""
+    controller = controller_of(controls={})
+    problem, known = controller.problem, {"noise": 1e-7, "initial_deviation": 1e-6}
+
+    def path_of(loop, steps):
+        loop.reset(x.numpy())
+        states, controls = [x], []
+        for _ in range(steps):
+            loop.step(states[-1][:1].numpy())
+            controls.append(torch.as_tensor(loop.acting))
+            states.append(problem.step(states[-1], controls[-1])[0].detach())
+        return torch.stack(states), torch.stack(controls)
+
+    x = torch.tensor([0.7, -0.4], dtype=torch.float64)
+    states, controls = path_of(controller.with_estimator(delay=delay, **known), 20)
+    assert_close(controls[:delay], torch.zeros(delay, 1, dtype=torch.float64))
+    following = states[delay]
+    for k in range(delay, 20):
+        u = torch.as_tensor(controller.policy(k * 0.05, following.numpy()))
+        assert_close(controls[k], u, rtol=1e-4, atol=1e-5)
+        following = problem.step(following, u)[0].detach()
+    without, _ = path_of(controller.with_estimator(**known), 20)
+    assert not torch.allclose(without[-1], states[-1], atol=1e-3)
+
+
+def test_a_plant_with_dead_time_is_steady_under_a_loop_that_knows_it_alone():
+    """A lasting law whose dead time of 0.4 s is not told makes the pendulum swing ever more."""
+    controller = controller_of(
+        controls={}, horizon={"steps": 200, "dt": 0.05}, cost={"Q": [10, 1], "R": 0.1, "Q_T": [10, 1]}
+    )
+    problem, delay, last = controller.problem, 8, {}
+    for told in (0, delay):
+        loop = controller.with_estimator(noise=1e-4, delay=told)
+        x, commands = torch.tensor([0.2, 0.0], dtype=torch.float64), [torch.zeros(1, dtype=torch.float64)] * delay
+        for k in range(150):
+            commands.append(torch.as_tensor(loop.step(x[:1].numpy(), applied=commands[max(k - 1, 0)].numpy())))
+            x = problem.step(x, commands[k])[0].detach().clamp(-100, 100)
+        last[told] = float(x.abs().max())
+    assert last[delay] < 0.01 < 1 < last[0]
+
+
+def test_acting_before_the_first_readings_is_refused():
+    with pytest.raises(ValueError, match="Expected acting after a call of step, got none since the reset"):
+        controller_of().with_estimator(delay=2).acting  # noqa: B018
+
+
 def test_reset_begins_with_an_estimate_at_a_time():
     feedback = controller_of().with_estimator()
     feedback.step([0.7])
@@ -145,6 +193,7 @@ def test_parameters_of_random_plants_are_estimated_and_the_law_is_not_told():
         (lambda c: c.with_estimator(noise=[0.1, 0.1]), "Expected outputs.noise with one entry"),
         (lambda c: c.with_estimator(noise=-0.1), "Expected outputs.noise > 0"),
         (lambda c: c.with_estimator(noise=0), "Expected outputs.noise > 0"),
+        (lambda c: c.with_estimator(delay=-1), "Expected outputs.delay ≥ 0, got -1"),
         (lambda c: c.with_estimator(measure=[]), "Expected outputs.measure, or a method output"),
         (lambda c: c.with_estimator(process_noise={"angle": -1}), "Expected outputs.process_noise.angle ≥ 0"),
         (lambda c: c.with_estimator(process_noise={"speed": 1}), "Expected outputs.process_noise among angle"),

@@ -21,6 +21,7 @@ from lyapnet.task.noise import StateNoise
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.expansions import riccati
 from tests.controller.test_output_feedback import TASK, controller_of
+from tests.evaluation.dead_time import TASKS, known_cost, mean_cost
 from tests.pages import ROOT, blocks
 from tests.problems import OfExpansion, problem_of
 
@@ -191,11 +192,35 @@ def test_the_tanks_of_the_page_are_a_task_whose_levels_one_reading_tells():
 
 
 def test_the_loop_of_the_page_runs(capsys):
-    loop, offset = [block for block in blocks("python", ROOT / "docs" / "outputs.md") if "loop.step" in block]
-    exec(loop, {})
+    loop, offset, late = [block for block in blocks("python", ROOT / "docs" / "outputs.md") if "loop.step" in block]
+    names: dict = {}
+    exec(loop, names)
     assert capsys.readouterr().out.startswith("0.02")  # two steps of 0.01 s after the first readings
     exec(offset.replace("pump", "torque"), {"controller": controller_of(), "y": [0.1]})
     assert capsys.readouterr().out.startswith("[")
+    exec(late, names)
+    assert capsys.readouterr().out == "[0.]\n"
+
+
+def test_a_command_measures_dead_time(capsys):
+    """Without any, and with what acts known, the cost is that of the evaluation's own loops."""
+    readings = ["--outputs", "cart position=0.012", "--outputs", "pole angle=0.012"]
+    command = ["evaluate", "zoo:cartpole_balancing", "--samples", "32", "--no-optimum", "--json", *readings]
+    ratios = []
+    for steps in (0, 5):
+        assert main([*command, "--delay", str(steps)]) == 0
+        found = json.loads(capsys.readouterr().out)["outputs"]
+        assert found["delay"] == steps
+        ratios.append(found["cost_ratio"])
+        assert ratios[-1] == pytest.approx(ratio_of("cartpole_balancing", steps), rel=0.02)
+    assert ratios[0] < 1.01 < 1.2 < ratios[1] < 1.3
+
+
+def ratio_of(name, delay):
+    """That of the page's table."""
+    torch.set_default_dtype(torch.float64)
+    controller = lyapnet.load(f"zoo:{name}")
+    return mean_cost(controller, TASKS[name], delay, told=True, states=32) / known_cost(controller, states=32)
 
 
 def test_a_run_that_diverges_makes_no_estimator_consistent():

@@ -89,7 +89,8 @@ class LoopTraces:
         )
         names = [system.state_names[i] for i in self.loop.settings.values()]
         settings = {"r": ", ".join(names)} if names else {}
-        return {"y": readings, **settings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind}
+        delay = {"delay": f"{self.loop.delay} steps from readings to their control"} if self.loop.delay else {}
+        return {"y": readings, **settings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind, **delay}
 
     def functions(self, tables: Tables) -> tuple[str, int]:
         """The text of the traced functions, and how many numbers a step has on the stack if they become parts of it."""
@@ -99,6 +100,7 @@ class LoopTraces:
             bodies.append(body)
             total += size
         own = self.estimated + self.estimated**2 + self.readings + self.controls  # of the function for a step
+        own += self.estimated if self.loop.delay else 0
         return "\n".join(bodies), total + own
 
     def declarations(self, style: Style) -> str:
@@ -106,19 +108,24 @@ class LoopTraces:
         name, macro, real = style.name, style.macro, style.real
         n = f"{macro}_ESTIMATED"
         settings = f" const {real} r[{macro}_SETTINGS]," if self.settings else ""
+        delay = self.loop.delay
+        later = (
+            f"    {real} later[{delay}][{macro}_CONTROLS];  /* those of the intervals after it */\n" if delay else ""
+        )
+        says = f"\n   It acts from {delay} calls after this one on; loop->u acts until the next call." if delay else ""
         return (
             f"/* A loop. After {name}_reset other estimates may be written to x and P, and a first time to start. */\n"
             f"typedef struct {{\n    {real} x[{n}];  /* the estimate after the last readings */\n"
             f"    {real} P[{n} * {n}];  /* its covariance, by rows */\n"
             f"    {real} u[{macro}_CONTROLS];  /* the control that acts until the next readings */\n"
-            f"    {real} t;  /* s, of the last readings */\n    {real} start;  /* s, of the first ones */\n"
+            f"{later}    {real} t;  /* s, of the last readings */\n    {real} start;  /* s, of the first ones */\n"
             f"    unsigned long calls, begun;  /* steps so far, and at the last change of r */\n"
             f"}} {name}_loop;\n\nvoid {name}_reset({name}_loop *loop);\n\n"
             f"/* u after readings y at loop->t, once in each {macro}_DT; NaN is a reading that is missing."
-            f"{SETTINGS_SAY if self.settings else ''} */\n"
+            f"{says}{SETTINGS_SAY if self.settings else ''} */\n"
             f"int {name}_step({name}_loop *loop, const {real} y[{macro}_READINGS],{settings} "
             f"{real} u[{macro}_CONTROLS]);\n\n"
-            "/* The control that the plant got since the last step, if it is not the one returned. */\n"
+            "/* The control that the plant got since the last step, if it is not loop->u. */\n"
             f"int {name}_applied({name}_loop *loop, const {real} u[{macro}_CONTROLS]);\n\n"
         )
 
@@ -129,6 +136,9 @@ class LoopTraces:
         box, domain, known = problem.initial_states, loop.controller.problem.domain, len(tried.lower)
         first = problem.controls.project(problem.rest)
         members = [numbers_of(box.center), numbers_of(torch.diag(loop.deviation.square()).flatten()), numbers_of(first)]
+        if loop.delay:
+            members.append(f"{{{', '.join([numbers_of(first)] * loop.delay)}}}")
+        x_then = "ahead" if loop.delay else "loop->x"
         tables = [box_table("first_known", box.lower[:known], box.upper[:known])]
         checks = [f"if (!is_inside({known}, loop->x, known)) code |= {macro}_OUTSIDE;"]
         if domain is not None:
@@ -145,9 +155,11 @@ class LoopTraces:
             tables.append(box_table("ranges", box.lower[which] - room, box.upper[which] + room))
         words = {
             "SETTINGS": change if which else "",
-            "LAW": ", ".join({"t": "&clock", "x": "loop->x", "p": f"loop->x + {len(law.arguments['x'])}"}[each]
+            "LAW": ", ".join({"t": "&clock", "x": x_then, "p": f"{x_then} + {len(law.arguments['x'])}"}[each]
                              for each in law.arguments),
-            "OFF": TAKE_OFF if "take_off" in self._parts else "",
+            "OFF": TAKE_OFF if "take_off" in self._parts else "", "THEN": x_then,
+            "NEXT": SHIFT if loop.delay else "", "AHEAD": AHEAD if loop.delay else "", "DELAY": loop.delay,
+            "LAST": f"later[{loop.delay - 1}]" if loop.delay else "u",
             "R": f"const double r[{len(which)}], " if which else "",
             "NAME": name, "MACRO": macro, "N": n, "M": m, "P": p, "KNOWN": known, "FIRST": ", ".join(members),
             "TRUSTED": literal(TRUSTED), "DT": problem.horizon.dt.hex(), "CHECKS": "\n    ".join(checks),
@@ -222,21 +234,21 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
     if (loop->calls > 0) {
         predict_of(loop->x, loop->P, loop->u, x, P);
         code |= keep(loop, x, P);
-    }
+@NEXT    }
     unsigned long k = loop->calls;
     loop->t = (double)((WIDE)loop->start + (WIDE)k * @DT);
     if (k + 1 > 0) loop->calls++;
     correct_of(loop->x, loop->P, known_y, x, P);
     code |= keep(loop, x, P);
 @SETTINGS    double clock = loop->begun > 0 ? (double)((WIDE)(k - loop->begun) * @DT) : loop->t;
-    control_of(@LAW, next);
+@AHEAD    control_of(@LAW, next);
     @OFF
     @LIMIT
     if (is_finite(@M, next))
-        for (int i = 0; i < @M; i++) loop->u[i] = next[i];
+        for (int i = 0; i < @M; i++) loop->@LAST[i] = next[i];
     else
         code |= @MACRO_NOT_FINITE;
-    for (int i = 0; i < @M; i++) u[i] = loop->u[i];
+    for (int i = 0; i < @M; i++) u[i] = loop->@LAST[i];
     @CHECKS
     for (int i = 0; loop->calls == 1 && i < @KNOWN; i++) {
         double room = @TRUSTED * sqrt(loop->P[i * @N + i]);
@@ -249,7 +261,20 @@ int @NAME_step(@NAME_loop *loop, const double y[@P], @Rdouble u[@M])
 
 TAKE_OFF = """double of_law[@M];
     for (int i = 0; i < @M; i++) of_law[i] = next[i];
-    take_off_of(of_law, loop->x, next);"""
+    take_off_of(of_law, @THEN, next);"""
+SHIFT = """        for (int i = 0; i < @M; i++) {
+            loop->u[i] = loop->later[0][i];
+            for (int j = 1; j < @DELAY; j++) loop->later[j - 1][i] = loop->later[j][i];
+        }
+"""
+AHEAD = """    clock = (double)((WIDE)clock + (WIDE)@DELAY * @DT);
+    double ahead[@N];
+    for (int i = 0; i < @N; i++) ahead[i] = loop->x[i];
+    for (int j = 0; j < @DELAY; j++) {
+        predict_of(ahead, loop->P, j == 0 ? loop->u : loop->later[j - 1], x, P);
+        for (int i = 0; i < @N; i++) ahead[i] = x[i];
+    }
+"""
 ENDS = """static const int ranged[@K] = {@WHICH};
     for (int i = 0; i < @K; i++)
         if (loop->x[ranged[i]] <= ends[i][0] || loop->x[ranged[i]] >= ends[i][1]) code |= @MACRO_AT_RANGE_END;"""
@@ -283,7 +308,8 @@ class CompiledLoop:
 
         class Memory(ctypes.Structure):
             _fields_ = [
-                ("x", number * n), ("P", number * (n * n)), ("u", number * m), ("t", number), ("start", number),
+                ("x", number * n), ("P", number * (n * n)), ("u", number * m),
+                ("later", number * (m * traces.loop.delay)), ("t", number), ("start", number),
                 ("calls", ctypes.c_ulong), ("begun", ctypes.c_ulong),
             ]  # fmt: skip
 
@@ -399,7 +425,8 @@ def _path_of(loop: OutputFeedback) -> _Path:
         settings = loop.named_settings(r) if changed else {}
         u = loop.step(y, applied=other, **settings).double().cpu()
         rows.append((y, torch.full_like(u, torch.nan) if other is None else other, r, u, *loop.belief))
-        replaced = float(torch.rand((), generator=draw)) < ELSEWHERE and bool(u.isfinite().all())
-        other = problem.controls.project(0.9 * u) if replaced else None
-        x = problem.step(x, u if other is None else other)[0]
+        acting = loop.acting
+        replaced = float(torch.rand((), generator=draw)) < ELSEWHERE and bool(acting.isfinite().all())
+        other = problem.controls.project(0.9 * acting) if replaced else None
+        x = problem.step(x, acting if other is None else other)[0]
     return _Path(*map(torch.stack, zip(*rows, strict=True)))

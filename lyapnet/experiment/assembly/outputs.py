@@ -27,7 +27,7 @@ def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
         UsageError: a name, a length or a number does not fit, or h breaks its contract.
     """
     if config.noise is None:
-        if config.measure or config.process_noise or config.input_disturbances or config.initial_deviation is not None:
+        if config != OutputsConfig():
             raise UsageError(
                 "Expected outputs.noise, the standard deviation of each reading, got none; give one for each."
             )

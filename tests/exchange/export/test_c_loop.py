@@ -104,6 +104,9 @@ LOOPS = {
     ).with_estimator(),
     "settings": lambda: controller_of("hold", family={"target_angle": [-0.4, 0.4], "length": [0.9, 1.1]}, **SWING)
     .with_estimator(),
+    "a delay": lambda: controller_of().with_estimator(delay=1),
+    "a delay and settings": lambda: controller_of("hold", family={"target_angle": [-0.4, 0.4]}, **SWING)
+    .with_estimator(input_disturbances={"torque": 0.1}, delay=3),
     "a domain": lambda: controller_of(parts=Parts(system=Tanks()), **TANKS).with_estimator(),
     "one state": lambda: controller_of(
         parts=Parts(system=Level()), cost={"Q": [1], "R": 0.1, "Q_T": [2]}, outputs={}

@@ -64,6 +64,7 @@ def test_up_to_the_longest_hold_in_closed_form_it_is_certified():
     assert claim.volume_share == 1
 
 
+@pytest.mark.gate
 def test_beyond_it_the_run_that_fails_is_named():
     readings = held(1.05 * longest_hold())
     claim = proved(readings)
@@ -85,6 +86,7 @@ def claimed(budget=20_000, keep=None, **options):
     return certify(controller(), claim, budget=Budget(AMPLE, boxes=budget), keep=keep)
 
 
+@pytest.mark.gate
 def test_a_jitter_is_a_longer_hold():
     assert claimed(time="held", jitter=6.0).verdict == "certified"  # 0.7 s
     certificate = claimed(time="held", jitter=6.7)  # 0.77 s
@@ -93,6 +95,7 @@ def test_a_jitter_is_a_longer_hold():
     assert "s later" in certificate.verdict_text()
 
 
+@pytest.mark.gate
 def test_the_claim_says_when_u_is_read():
     words = claimed(jitter=0.1, delay=0.05, measured={"x1": 0.01}, quantised={"u1": 0.02}).in_words()
     assert "with u read at any times at most 0.11 s apart, used in this order, at most 0.05 s later" in words
@@ -100,6 +103,7 @@ def test_the_claim_says_when_u_is_read():
     assert "with u read at every t" in claimed().in_words()
 
 
+@pytest.mark.gate
 def test_a_law_that_is_made_to_be_held_is_held_in_the_claim():
     about, _ = integrator()
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
@@ -148,6 +152,7 @@ def test_limits_that_follow_the_state_need_a_law_that_is_read_at_every_t():
     assert "read_within" not in certify(made, Funnel(alpha=ALPHA, delta=0.1), budget=2).result
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_of_its_readings(tmp_path):
     kept = tmp_path / "held.proof"
     assert claimed(keep=kept, time="held", jitter=0.5, delay=0.02).verdict == "certified"
@@ -191,6 +196,7 @@ def edge_of(claim, V, many):
     return x * (claim.rho / V(torch.zeros(()), x)).sqrt()[:, None] * (1 - 1e-9)
 
 
+@pytest.mark.gate
 def test_loops_with_jitter_delay_errors_and_pushes_stay_in_the_funnel():
     claim, (about, loop) = hard_claim(), plane()
     assert claim.verdict == "certified"
@@ -281,6 +287,7 @@ def held_region():
     return region_claim(Readings(0.02, 0.01, (0.002, 0.002), (0.0,), None))
 
 
+@pytest.mark.gate
 def test_a_held_law_keeps_its_region_and_enters_the_ultimate_set():
     _, loop, claim = held_region()
     assert claim.rho > 0.99 * claim.rim
@@ -310,6 +317,7 @@ def test_where_the_held_law_is_unstable_no_region_is_claimed():
     assert claim.verdict != "certified"
 
 
+@pytest.mark.gate
 def test_a_kept_region_is_of_its_readings(tmp_path):
     about, *_ = held_region()
     kept = tmp_path / "region.proof"
@@ -327,6 +335,7 @@ def test_a_kept_region_is_of_its_readings(tmp_path):
         certify(made, other, budget=Budget(AMPLE, boxes=1000), keep=kept)
 
 
+@pytest.mark.gate
 def test_parameters_and_readings_together():
     from tests.claims.test_plants import leaky
 
@@ -347,6 +356,7 @@ def test_where_the_level_set_is_empty_nothing_is_claimed(V):
     assert claim.verdict != "certified"
 
 
+@pytest.mark.gate
 def test_what_failed_after_a_reading_goes_into_training():
     certificate = claimed(budget=4000, interval=0.8)
     assert certificate.verdict == "falsified"

@@ -194,6 +194,7 @@ def test_without_width_the_claim_is_that_of_the_one_plant():
 # Plants
 
 
+@pytest.mark.gate
 def test_no_plant_leaves_and_each_goes_to_the_goal():
     """Closed loops from the region's edge, for plants at the ends of P and inside."""
     claim, about = springs(), spring()

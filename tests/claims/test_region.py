@@ -285,6 +285,7 @@ def test_what_jumps_far_from_the_goal_is_no_obstacle_there(dtype):
     assert 1.0 < float(found.box.upper) < 1.9
 
 
+@pytest.mark.gate
 def test_a_constraint_bounds_the_region():
     wall = StateLimits([0], [1.0], [1.0], [1.0], ["position ≤ 1"])
     claim, P = claimed(about=problem(constraints=wall)), torch.from_numpy(riccati())

@@ -92,6 +92,7 @@ def test_a_parameter_that_walks_faster_than_outputs_tell_is_named(walk, named):
     assert found.advice.startswith("a smaller walk of length") == named
 
 
+@pytest.mark.gate
 def test_check_names_what_outputs_do_not_tell(tmp_path, capsys):
     (tmp_path / "task.yaml").write_text(yaml.safe_dump(TASK))
     command = ["check", str(tmp_path / "task.yaml"), "--json", "outputs.measure=[angle]"]

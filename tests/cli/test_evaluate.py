@@ -146,6 +146,7 @@ def test_without_casadi_a_training_goes_on(tmp_path, capsys):
     )
 
 
+@pytest.mark.gate
 def test_a_training_is_compared_with_the_same_optimum_to_its_end(run, trained, capsys, tmp_path):
     def kept(folder):
         (cost,) = read_checkpoint(folder / "checkpoints" / "last.ckpt")["callbacks"]["ValidationOptimum"]["cost"]

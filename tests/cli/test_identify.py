@@ -34,6 +34,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.gate
 def test_the_config_goes_on_with_values_and_ranges(folder, capsys):
     assert main(["identify", "pendulum.yaml", "one.csv", "two.csv", "horizon.steps=20"]) == 0
     said = capsys.readouterr().out

@@ -112,6 +112,7 @@ def test_text_of_users_is_escaped(tmp_path, monkeypatch):
     assert "<script>" in hostile._repr_html_()
 
 
+@pytest.mark.gate
 def test_numbers_are_those_on_record_beside_the_best_checkpoint(tmp_path):
     folder = tmp_path / "checkpoints"
     folder.mkdir()

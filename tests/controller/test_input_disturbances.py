@@ -42,6 +42,7 @@ def run(controller, loop, d, steps=STEPS, x=(0.5, 0.0)):
     return torch.cat(states), torch.cat(controls)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])
 def test_a_constant_disturbance_leaves_no_offset(kind):
     controller = controller_of(**ESTIMATED)
@@ -111,6 +112,7 @@ def test_a_law_of_single_precision_keeps_its_limits():
     assert u.max() == controller.problem.controls.upper.max()
 
 
+@pytest.mark.gate
 def test_an_evaluation_draws_disturbances_about_which_the_filter_is_not_too_sure():
     """They are constant, where the filter lets them drift: its covariance is larger than the errors."""
     controller = controller_of(**ESTIMATED)

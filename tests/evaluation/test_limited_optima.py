@@ -13,7 +13,6 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import Box, ControlBox
 from lyapnet.task.systems import Linear
 from lyapnet.value.expansions import optimal_trajectories
-from tests.marks import sample
 from tests.problems import problem_of
 
 pytest.importorskip("casadi")
@@ -27,7 +26,8 @@ def limited(cost=1.0, unit=1.0):
     return problem_of(system, QuadraticCost(weight, [[cost * unit**2]], weight), 60, 0.05, controls=controls)
 
 
-@pytest.mark.parametrize(("cost", "unit"), sample([(1.0, 1.0), (1e-4, 1.0), (1e12, 1.0), (1.0, 1e4), (1.0, 1e-6)], 5))
+@pytest.mark.gate
+@pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e-4, 1.0), (1e12, 1.0), (1.0, 1e4), (1.0, 1e-6)])
 def test_units_do_not_matter(cost, unit):
     problem = limited(cost, unit)
     x0 = problem.initial_states.sample(3, torch.Generator().manual_seed(0))

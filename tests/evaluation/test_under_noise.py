@@ -134,6 +134,7 @@ def test_a_worse_law_costs_more_and_a_wrong_V_keeps_the_mean():
     assert abs(float(table.cost.mean()) - noise.plain_mean) < 2 * (noise.half_width + noise.plain_half_width)
 
 
+@pytest.mark.gate
 def test_with_risk_costs_are_certainty_equivalents_those_of_the_oracle():
     problem = task(risk=1.0)
     x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
@@ -175,6 +176,7 @@ def test_a_risk_that_no_path_shows_is_not_measured(shift):
     assert "not measured" in [str(cell) for cell in evaluation_table("title", result).columns[1]._cells]
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("shift", [-0.3, 0.3])
 def test_a_wrong_V_keeps_the_certainty_equivalent(shift):
     problem = task(risk=1.0)

@@ -63,6 +63,7 @@ def swing():
     return learner, start, told
 
 
+@pytest.mark.gate
 def test_a_linear_task_is_solved_before_the_first_step(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.optima_for", None)  # no step gains on Riccati's law: none is sought
     (learner,), start = started(LINEAR)

@@ -194,6 +194,7 @@ def test_readings_that_are_none_and_failures_are_told(tmp_path):
     assert np.isfinite(x_hat).all()
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_loop_says_while_a_parameter_is_at_an_end_of_its_range(dtype, tmp_path):
     """A plant of 3 m where 0.5 to 1.5 m are known; the code is there at the steps at which Python's name is."""
@@ -337,6 +338,7 @@ def test_the_example_prints_controls_within_their_limits_if_some_readings_lead_t
     assert (max(u) < limit) == inside
 
 
+@pytest.mark.gate
 def test_the_law_is_written_once(tmp_path):
     """A loop calls the function of the law, and takes estimated disturbances off afterwards."""
     for name in ("a pendulum", "a disturbance"):
@@ -348,6 +350,7 @@ def test_the_law_is_written_once(tmp_path):
         assert code.count("control_of(") == 3, "its definition, lyapnet_control and lyapnet_step"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("measured", [True, False])
 def test_a_training_prints_the_export_of_what_reads_its_outputs(measured, tmp_path, capsys):
     overrides = [

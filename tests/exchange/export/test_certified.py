@@ -55,6 +55,7 @@ def copied_of(folder, place):
     return shutil.copytree(folder, place / "copy")
 
 
+@pytest.mark.gate
 def test_the_claim_names_the_file_and_how_far_it_is_off(exported):
     _, folder, _, certificate = exported
     result, bodies = certificate.result, [(folder / name).read_text() for name in ("policy.h", "policy.c")]
@@ -91,6 +92,7 @@ def test_steps_of_quantised_controls_and_errors_of_the_file_add(exported):
     assert result["control_errors"]["u1"] == 0.01 + result["computed_within"]["u1"]
 
 
+@pytest.mark.gate
 def test_a_proof_is_checked_with_its_file_alone(exported, tmp_path):
     controller, folder, proof, certificate = exported
     result = check(controller, proof, law=CertifiedFiles(controller, folder).law())
@@ -104,6 +106,7 @@ def test_a_proof_is_checked_with_its_file_alone(exported, tmp_path):
     assert f"got {law.sha256}; name" in refused["reason"]
 
 
+@pytest.mark.gate
 def test_a_claim_stands_in_the_header_and_an_edited_one_is_found(exported, tmp_path):
     controller, folder, proof, _ = exported
     place = copied_of(folder, tmp_path)

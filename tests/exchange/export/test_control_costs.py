@@ -42,6 +42,7 @@ def controller(request):
     return Controller(build_problem(config_from_plain(plain)), Bowl(), policy=SampledPolicy)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("radius", [2.0, 0.3])
 def test_a_ball_is_not_left_in_single_precision(radius, tmp_path):
     plain = {

@@ -25,6 +25,7 @@ from lyapnet.training.build import build_data
 from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
+from lyapnet.training.limit_facts import limit_facts
 from lyapnet.training.loggers import drop_logs_after, log_result, without_writer_tracebacks
 from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.plan import Plan, plan_run, under_policy
@@ -125,7 +126,8 @@ def _fit(plan: Plan, console: Console) -> dict[str, Any]:
             )
         else:
             problem = plan.module.members[0].problem
-            for fact in (*jump_facts(problem), *kink_facts(problem)):
+            advised = (fact for fact in limit_facts(problem) if fact.advice)
+            for fact in (*jump_facts(problem), *kink_facts(problem), *advised):
                 console.print(f"note: {'; '.join(filter(None, fact[1:]))}.", soft_wrap=True)
     started = time.perf_counter()
     try:

@@ -26,6 +26,7 @@ from lyapnet.task.systems import moving_states
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
 from lyapnet.training.config_facts import OBSERVABLE, Fact, format_numbers
 from lyapnet.training.learner import Learner
+from lyapnet.training.limit_facts import limit_facts
 from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.training.start import NOT_FINITE_REMEDY, STEP_ERROR_REMEDY, TRIAL_STATES
@@ -92,7 +93,7 @@ def facts_of(
         elif (around := linearised(exact)).missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
-            tell(_goal_fact(exact, around, problem.goal.dtype), *_mode_facts(exact, around))
+            tell(_goal_fact(exact, around, problem.goal.dtype), *_mode_facts(exact, around), *limit_facts(exact))
             gain = step_gain(exact, learner.rollout)
             if around.missing is not None and around.missing.reason in gain.found:
                 gain = Fact(STEP_GAIN, "unknown, for the reason above")

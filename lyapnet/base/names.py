@@ -9,7 +9,7 @@ def joined(name: Any) -> str:
     return str(name).replace(" ", "_")
 
 
-def identifier(name: str) -> str:
-    """A name of letters, digits and _, of a joint or motor in a robot's file."""
+def identifier(name: str, kind: str = "joint") -> str:
+    """A name of letters, digits and _, as of a joint in a file; its kind comes first if no letter does."""
     text = re.sub(r"\W", "_", name)
-    return text if text[:1].isalpha() else f"joint_{text}"
+    return text if text[:1].isalpha() else f"{kind}_{text}"

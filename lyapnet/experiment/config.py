@@ -101,6 +101,7 @@ class SystemConfig:
     states: dict[str, str] = setting({}, "Name and unit of each state of the equations, in their order.")
     controls: dict[str, str] = setting({}, "Name and unit of each control, likewise.")
     angles: list[str] = setting([], "Names of the states of the equations that are angles in rad.")
+    title: str = setting("", "What a system of equations is called in tables and messages; of a file, the file's name.")
 
 
 @dataclass
@@ -438,7 +439,8 @@ def _with_model(config: Config, folder: Path) -> Config:
 
     path = folder / system.file
     read, limits = model_of_file(path, system.name, system.states, system.controls, system.parameters)
-    system = dataclasses.replace(system, file="", **{**read, "angles": system.angles or read["angles"]})
+    own = {"angles": system.angles or read["angles"], "title": system.title or path.stem}
+    system = dataclasses.replace(system, file="", **{**read, **own})
     controls = config.controls
     if limits and controls == ControlsConfig():
         controls = dataclasses.replace(controls, lower=_none_if_infinite(limits[0]), upper=_none_if_infinite(limits[1]))

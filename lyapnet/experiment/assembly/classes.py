@@ -103,7 +103,10 @@ def class_of_equations(options: SystemConfig) -> type[EquationSystem]:
     if not options.equations:
         advice = "name the model's file in system.file" if options.name in KINDS else "write der(STATE) = … for each"
         raise UsageError(f"Expected system.equations with system.name={options.name}, got none; {advice}.")
-    return defined(options.equations, options.states, options.controls, list(options.parameters), options.angles)
+    named = {"title": options.title} if options.title else {}
+    return defined(
+        options.equations, options.states, options.controls, list(options.parameters), options.angles, **named
+    )
 
 
 def instance_of(options: Any, part: str) -> Any:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import joined
+from lyapnet.base.names import identifier, joined
 from lyapnet.base.types import Control, InputMatrix, State
 from lyapnet.task.systems.base import ControlSystem
 from lyapnet.task.systems.formulas import Formulas, Number
@@ -119,7 +119,7 @@ def system_class(definition: Definition) -> type[EquationSystem]:
         "definition": definition, "__doc__": EquationSystem.__doc__,
         "formulas": Formulas(definition.equations, definition.names, results, controls),
     }  # fmt: skip
-    cls = type("EquationSystem", (EquationSystem,), own)
+    cls = type(identifier(definition.title, "system"), (EquationSystem,), own)
     keyword = inspect.Parameter.KEYWORD_ONLY
     cls.__signature__ = inspect.Signature(  # pyright: ignore[reportAttributeAccessIssue]
         [inspect.Parameter(name, keyword, annotation=float) for name in definition.parameters]

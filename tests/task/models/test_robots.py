@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import load_config
 from lyapnet.task.models import reading, robots
 from lyapnet.task.models.systems import TOLERANCE
@@ -153,6 +154,7 @@ def test_a_file_brings_names_units_and_limits(tmp_path):
     found = load_config(config(tmp_path, "urdf", arm()))
     assert found.system.states == {"elbow_pitch": "rad", "elbow_pitch_rate": "rad/s"}
     assert found.system.angles == ["elbow_pitch"]
+    assert build_problem(found).system.title == "robot", "the file's name"
     assert (found.controls.lower, found.controls.upper) == ([-5.0], [5.0])
     found = load_config(config(tmp_path, "urdf", arm(), controls={"lower": -1, "upper": 1}))
     assert (found.controls.lower, found.controls.upper) == (-1, 1)

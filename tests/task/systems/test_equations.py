@@ -57,6 +57,17 @@ def refusal(text, **options):
     return message
 
 
+@pytest.mark.parametrize(("title", "told", "name"), [
+    ("", "Equations", "Equations"), ("pole on a cart", "pole on a cart", "pole_on_a_cart"),
+    ("3 links", "3 links", "system_3_links"),
+])  # fmt: skip
+def test_what_a_system_is_called(title, told, name):
+    config = config_from_plain({**TASK, "system": {**TASK["system"], "title": title}})
+    problem = build_problem(config)
+    assert (problem.system.title, type(problem.system).__name__) == (told, name)
+    assert type(pickle.loads(pickle.dumps(problem.system))) is type(problem.system)
+
+
 def test_a_pendulum_is_the_registered_one():
     system = build_problem(config_from_plain(TASK)).system
     other = Pendulum(mass=2.0, length=0.5, damping=0.3, gravity=9.81).double()

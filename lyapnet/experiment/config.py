@@ -5,6 +5,7 @@ A YAML file lists only values that differ from these defaults; `key.sub=value` o
 
 import dataclasses
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,8 +21,9 @@ from lyapnet.experiment.recipe import STANDARD, with_recipe
 from lyapnet.experiment.schema import Names, check_values, checked, differences, read_yaml, setting
 from lyapnet.task.models.reading import KINDS
 
-MOST_LINES = 20  # lines of equations in tables and text of loggers
-EQUATIONS = "EQUATIONS"  # in their place while the rest is written as YAML
+TEXTS = ("equations", "drawing")  # keys of the section system whose values have many lines
+MOST_LINES = 20  # lines of each in tables and text of loggers
+PLACE = "TEXT"  # in their place while the rest is written as YAML
 
 # names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
@@ -101,6 +103,9 @@ class SystemConfig:
     states: dict[str, str] = setting({}, "Name and unit of each state of the equations, in their order.")
     controls: dict[str, str] = setting({}, "Name and unit of each control, likewise.")
     angles: list[str] = setting([], "Names of the states of the equations that are angles in rad.")
+    drawing: str = setting(
+        "", "Shapes of the equations' system: lines line(x, y, …), faint, polygon, disk and arrow, in m.", lines=True
+    )
     title: str = setting("", "What a system of equations is called in tables and messages; of a file, the file's name.")
 
 
@@ -439,7 +444,9 @@ def _with_model(config: Config, folder: Path) -> Config:
 
     path = folder / system.file
     read, limits = model_of_file(path, system.name, system.states, system.controls, system.parameters)
-    own = {"angles": system.angles or read["angles"], "title": system.title or path.stem}
+    own = {key: getattr(system, key) or read[key] for key in ("angles", "drawing")} | {
+        "title": system.title or path.stem
+    }
     system = dataclasses.replace(system, file="", **{**read, **own})
     controls = config.controls
     if limits and controls == ControlsConfig():
@@ -496,23 +503,28 @@ def to_plain(config: Config) -> dict[str, Any]:
 
 
 def abridged(config: Config) -> Config:
-    """The config for tables and text of loggers: of long equations, the first lines."""
-    lines = config.system.equations.splitlines()
-    if len(lines) <= MOST_LINES:
-        return config
-    text = "\n".join([*lines[:MOST_LINES], f"# and {len(lines) - MOST_LINES} further lines, in config.yaml"])
-    return dataclasses.replace(config, system=dataclasses.replace(config.system, equations=text))
+    """The config for tables and text of loggers: of long texts, the first lines."""
+    texts = {key: getattr(config.system, key).splitlines() for key in TEXTS}
+    shortened = {
+        key: "\n".join([*lines[:MOST_LINES], f"# and {len(lines) - MOST_LINES} further lines, in config.yaml"])
+        for key, lines in texts.items()
+        if len(lines) > MOST_LINES
+    }
+    return dataclasses.replace(config, system=dataclasses.replace(config.system, **shortened))
 
 
 def to_yaml(config: Config) -> str:
-    """The resolved config as YAML; one number for all readings is written as such, and equations line by line."""
+    """The resolved config as YAML; one number for all readings is written as such, and texts line by line."""
     plain = to_plain(config)
-    if equations := plain["system"]["equations"]:
-        plain["system"]["equations"] = EQUATIONS
-        ending = "+" if equations.endswith("\n") else "-"
-        block = f"equations: |2{ending}\n{textwrap.indent(equations, '    ')}".removesuffix("\n")
-        return _to_yaml(plain).replace(f"equations: {EQUATIONS}", block, 1)
-    return _to_yaml(plain)
+    blocks = {key: text for key in TEXTS if (text := plain["system"][key])}
+    plain["system"].update(dict.fromkeys(blocks, PLACE))
+
+    def block(found: re.Match[str]) -> str:
+        text = blocks[found[1]]
+        ending = "+" if text.endswith("\n") else "-"
+        return f"  {found[1]}: |2{ending}\n{textwrap.indent(text, '    ')}".removesuffix("\n")
+
+    return re.sub(rf"^  ({'|'.join(TEXTS)}): {PLACE}$", block, _to_yaml(plain), flags=re.MULTILINE)
 
 
 def _to_yaml(plain: dict[str, Any]) -> str:

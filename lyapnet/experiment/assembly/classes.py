@@ -105,7 +105,13 @@ def class_of_equations(options: SystemConfig) -> type[EquationSystem]:
         raise UsageError(f"Expected system.equations with system.name={options.name}, got none; {advice}.")
     named = {"title": options.title} if options.title else {}
     return defined(
-        options.equations, options.states, options.controls, list(options.parameters), options.angles, **named
+        options.equations,
+        options.states,
+        options.controls,
+        list(options.parameters),
+        options.angles,
+        drawing=options.drawing,
+        **named,
     )
 
 

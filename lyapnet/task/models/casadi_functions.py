@@ -7,7 +7,7 @@ lyapnet.task.models.reading.
 import keyword
 import math
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from lyapnet.base.errors import UsageError, one_line
@@ -45,6 +45,7 @@ class Model(NamedTuple):
         units: of states and controls; none: not known.
         angles: names of the states that are angles in rad.
         limits: least and greatest controls; None: not known.
+        drawing: lines as of lyapnet.task.systems.drawing; empty: not known.
     """
 
     equations: str
@@ -55,6 +56,7 @@ class Model(NamedTuple):
     units: Sequence[str] = ()
     angles: Sequence[str] = ()
     limits: list[list[float]] | None = None
+    drawing: str = ""
 
 
 def model_of_function(function: Any, states: Sequence[str] = (), controls: Sequence[str] = ()) -> Model:
@@ -89,9 +91,16 @@ def model_of_function(function: Any, states: Sequence[str] = (), controls: Seque
     taken = [name for each in names.values() for name in each]
     if twice := [name for k, name in enumerate(taken) if name in taken[:k]]:
         raise UsageError(f"Expected different names of x, u and p, got {twice[0]} twice; name states and controls.")
-    lines = list(_lines(casadi, expanded, names, result, _prefix(taken)))
+    lines, texts = assignments(expanded, names, taken)
     x, u, *p = (names[i] for i in inputs)
-    return Model("\n".join(lines), x, u, [name for each in p for name in each], list(_values(function, inputs, result)))
+    rates = [f"der({state}) = {texts[result].get(i, '0')}" for i, state in enumerate(x)]
+    return Model(
+        "\n".join([*lines, *rates]),
+        x,
+        u,
+        [name for each in p for name in each],
+        list(_values(function, inputs, result)),
+    )
 
 
 def _expanded(casadi: Any, function: Any) -> Any:
@@ -205,39 +214,44 @@ def _prefix(taken: Sequence[str]) -> str:
     return prefix
 
 
-def _lines(casadi: Any, function: Any, names: dict[int, list[str]], result: int, prefix: str) -> Iterator[str]:
-    """The assignments of a function's operations, in their order."""
+def assignments(
+    function: Any, names: Mapping[int, Sequence[str]], taken: Sequence[str]
+) -> tuple[list[str], list[dict[int, str]]]:
+    """The operations of an SX function as assignments, in their order; and for each result the texts of its entries.
+
+    Args:
+        names: of the entries of each input by its index; others are 0.
+        taken: names that intermediate results do not have.
+    """
+    import casadi
+
+    prefix = _prefix(taken)
+
     known = {getattr(casadi, f"OP_{name}"): form for name, form in EXPRESSIONS.items()}
-    states = next(iter(names.values()))
-    held: dict[int, str] = {}  # the work vector's entries
-    count = 0
-    derivatives = dict.fromkeys(states, "0")
-    rows = function.sparsity_out(result).row()
+    held, lines = dict[int, str](), list[str]()  # held: the entries of the work vector
+    rows = [function.sparsity_out(i).row() for i in range(function.n_out())]
+    results: list[dict[int, str]] = [{} for _ in rows]
     for k in range(function.n_instructions()):
         operation, given, places = (
             function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
         )  # fmt: skip
         if operation == casadi.OP_OUTPUT:
-            if places[0] == result:
-                derivatives[states[rows[places[1]]]] = held[given[0]]
-            continue
-        if operation == casadi.OP_INPUT:
-            held[places[0]] = names[given[0]][given[1]] if given[0] in names else "0"  # time, which does not count
-            continue
-        if operation == casadi.OP_CONST:
+            results[places[0]][rows[places[0]][places[1]]] = held[given[0]]
+        elif operation == casadi.OP_INPUT:
+            held[places[0]] = names[given[0]][int(given[1])] if given[0] in names else "0"
+        elif operation == casadi.OP_CONST:
             held[places[0]] = _number(function.instruction_constant(k))
-            continue
-        if operation not in known:
+        elif operation in known:
+            name = f"{prefix}{len(lines)}"
+            lines.append(f"{name} = {known[operation].format(*(held[i] for i in given))}")
+            held[places[0]] = name
+        else:
             name = next((n for n in dir(casadi) if n.startswith("OP_") and getattr(casadi, n) == operation), operation)
             what = "OP_CALL of a solver, table or external function" if operation == casadi.OP_CALL else name
             raise UsageError(
                 f"Expected operations with an expression in {function.name()}, got CasADi's {what}; write it in others."
             )
-        yield f"{prefix}{count} = {known[operation].format(*(held[i] for i in given))}"
-        held[places[0]] = f"{prefix}{count}"
-        count += 1
-    for state, value in derivatives.items():
-        yield f"der({state}) = {value}"
+    return lines, results
 
 
 def _number(value: float) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from lyapnet.base.errors import UsageError
 from lyapnet.base.names import identifier
 from lyapnet.task.models.casadi_functions import Model, model_of_function
+from lyapnet.task.models.robot_drawings import Body, bodies_of_mjcf, bodies_of_urdf, drawing_of
 
 GRAVITY = 9.81  # m/s², in the direction −z, for URDF, which names none
 RATE, TORQUE, FORCE = "_rate", "_torque", "_force"  # what names end with of a joint's rate, and of what moves it
@@ -67,6 +68,7 @@ class Robot(NamedTuple):
     joints: list[Joint]
     actuators: list[Actuator]
     gravity: Sequence[float] = (0.0, 0.0, -GRAVITY)
+    bodies: Sequence[Body] = ()  # that the file draws
 
 
 def model_of_urdf(content: bytes, states: Sequence[str] = (), controls: Sequence[str] = ()) -> Model:
@@ -105,20 +107,41 @@ def _model(robot: Robot, states: Sequence[str], controls: Sequence[str]) -> Mode
         units=[*lengths, *(f"{unit}/s" for unit in lengths), *forces],
         angles=[name for name, each in zip(model.states, joints, strict=False) if not each.slides],
         limits=[[each.lower for each in robot.actuators], [each.upper for each in robot.actuators]],
+        drawing=_drawing(robot, [*model.states, *model.controls]),
     )
+
+
+def _drawing(robot: Robot, names: Sequence[str]) -> str:
+    """The lines that draw a robot in the plane in which it moves, or obliquely."""
+    import casadi
+
+    links, q = _links(robot), casadi.SX.sym("q", len(robot.joints))
+    given = [each.get("name", "") for each in ET.fromstring(robot.urdf).findall("link")]
+    frames = {name: links.forward_kinematics_fun(name)(casadi.DM.eye(4), _drawn(robot, q)) for name in given}
+    return drawing_of(robot.urdf, robot.bodies, frames, q, names)
+
+
+def _links(robot: Robot) -> Any:
+    """adam's algorithms for the links."""
+    from adam.casadi import KinDynComputations
+
+    gravity = np.array([*robot.gravity, 0.0, 0.0, 0.0])
+    return KinDynComputations(_with_turns_apart(robot.urdf), [each.name for each in robot.joints], gravity=gravity)
+
+
+def _drawn(robot: Robot, q: Any) -> Any:
+    """The positions of the joints from where the file draws them."""
+    return q - np.array([each.zero for each in robot.joints])
 
 
 def _function(robot: Robot, friction: bool = True) -> Any:
     """(x, u) ↦ ẋ as a CasADi function."""
     import casadi
-    from adam.casadi import KinDynComputations
 
-    d = len(robot.joints)
-    gravity = np.array([*robot.gravity, 0.0, 0.0, 0.0])
-    links = KinDynComputations(_with_turns_apart(robot.urdf), [each.name for each in robot.joints], gravity=gravity)
+    d, links = len(robot.joints), _links(robot)
     q, rate, u = casadi.SX.sym("q", d), casadi.SX.sym("v", d), casadi.SX.sym("u", len(robot.actuators))
     base = casadi.DM.eye(4)  # the first link stands still
-    drawn = q - casadi.DM([each.zero for each in robot.joints])
+    drawn = _drawn(robot, q)
     M = links.mass_matrix_fun()(base, drawn)[6:, 6:] + casadi.diag(casadi.DM([each.armature for each in robot.joints]))
     force = -links.bias_force_fun()(base, drawn, casadi.DM.zeros(6), rate)[6:]
     for i, each in enumerate(robot.joints):
@@ -165,6 +188,7 @@ def _robot_of_urdf(text: str) -> Robot:
     root = _tree(text)
     if root.tag != "robot":
         raise UsageError(f"Expected a URDF file, whose root is <robot>, got <{root.tag}>; for MJCF write name: mjcf.")
+    bodies = bodies_of_urdf(root)
     for link in root.findall("link"):
         _require_positive(link)
         for shown in [*link.findall("visual"), *link.findall("collision")]:
@@ -198,7 +222,7 @@ def _robot_of_urdf(text: str) -> Robot:
     for element in root.findall("joint"):  # the equations have no limits of q, and adam asks for all of their numbers
         for read in element.findall("limit") + element.findall("dynamics"):
             element.remove(read)
-    robot = Robot(ET.tostring(root, encoding="unicode"), joints, actuators)
+    robot = Robot(ET.tostring(root, encoding="unicode"), joints, actuators, bodies=bodies)
     _require_actuators(robot)
     return robot
 
@@ -279,7 +303,8 @@ def _robot_of_mjcf(mujoco: Any, model: Any) -> Robot:
             ))  # fmt: skip
         _add_link(root, f"body_{body}", model, body)
         _add_joint(root, f"body_{body}_mount", "fixed", last, f"body_{body}", place - _rotated(turn, offset), turn)
-    return Robot(ET.tostring(root, encoding="unicode"), joints, list(_actuators(mujoco, model)), model.opt.gravity)
+    urdf, bodies = ET.tostring(root, encoding="unicode"), list(bodies_of_mjcf(mujoco, model))
+    return Robot(urdf, joints, list(_actuators(mujoco, model)), model.opt.gravity, bodies)
 
 
 def _actuators(mujoco: Any, model: Any) -> Iterator[Actuator]:

@@ -17,7 +17,7 @@ TOLERANCE = 1e-12  # largest relative difference between equations and the model
 def model_of_file(
     path: Path, kind: str, states: Mapping[str, str], controls: Mapping[str, str], parameters: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[list[float]] | None]:
-    """The equations, states, controls and angles of a model's file, as the section `system` of a config has them.
+    """The equations, states, controls, angles and drawing of a model's file, as a config's section `system` has them.
 
     Args:
         kind: of KINDS.
@@ -32,7 +32,7 @@ def model_of_file(
     """
     model = Model(**read_model(path, kind, {"states": list(states), "controls": list(controls)}))
     section = _section(model, states, controls, parameters, path.name)
-    return {**section, "angles": list(model.angles)}, model.limits
+    return {**section, "angles": list(model.angles), "drawing": model.drawing}, model.limits
 
 
 def casadi_system(

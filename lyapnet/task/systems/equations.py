@@ -5,12 +5,15 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.names import identifier, joined
+from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, InputMatrix, State
 from lyapnet.task.systems.base import ControlSystem
+from lyapnet.task.systems.drawing import Drawing
 from lyapnet.task.systems.formulas import Formulas, Number
 
 
@@ -23,6 +26,7 @@ class Definition(NamedTuple):
         parameters: their names.
         angles: names of the states that are angles in rad.
         title: what the system is called in tables.
+        drawing: its shapes, as of lyapnet.task.systems.drawing; empty: none.
     """
 
     equations: str
@@ -31,6 +35,7 @@ class Definition(NamedTuple):
     parameters: tuple[str, ...] = ()
     angles: tuple[str, ...] = ()
     title: str = "Equations"
+    drawing: str = ""
 
     @property
     def names(self) -> list[str]:
@@ -53,6 +58,7 @@ class EquationSystem(ControlSystem):
 
     definition: Definition
     formulas: Formulas
+    drawing: Drawing
 
     def __init__(self, **parameters: float):
         super().__init__()
@@ -76,7 +82,8 @@ class EquationSystem(ControlSystem):
         return self.definition.title
 
     def attribute_of(self, parameter: str) -> str:
-        return f"value_of_{parameter}" if hasattr(ControlSystem, parameter) else parameter
+        taken = hasattr(ControlSystem, parameter) or parameter in EquationSystem.__annotations__
+        return f"value_of_{parameter}" if taken else parameter
 
     def dynamics(self, x: State, u: Control) -> State:
         x, u = _same_batch(x, u)
@@ -92,6 +99,11 @@ class EquationSystem(ControlSystem):
             return super().g(x)
         rows = self.formulas.slopes(self._values(x, [0.0] * self.m), x[..., 0])
         return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+        parameters = (getattr(self, self.attribute_of(name)) for name in self.definition.parameters)
+        values = (float(each) for each in (*x, *u, *parameters))
+        return self.drawing.shapes_at(dict(zip(self.definition.names, values, strict=True)))
 
     def _values(self, x: State, u: Sequence[Number]) -> dict[str, Number]:
         """The numbers that the equations name."""
@@ -118,6 +130,7 @@ def system_class(definition: Definition) -> type[EquationSystem]:
     own = {
         "definition": definition, "__doc__": EquationSystem.__doc__,
         "formulas": Formulas(definition.equations, definition.names, results, controls),
+        "drawing": Drawing(definition.drawing, definition.names),
     }  # fmt: skip
     cls = type(identifier(definition.title, "system"), (EquationSystem,), own)
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -129,11 +142,11 @@ def system_class(definition: Definition) -> type[EquationSystem]:
 
 def defined(
     equations: str, states: Mapping[str, str], controls: Mapping[str, str], parameters: Sequence[str] = (),
-    angles: Sequence[str] = (), title: str = "Equations",
+    angles: Sequence[str] = (), title: str = "Equations", drawing: str = "",
 ) -> type[EquationSystem]:  # fmt: skip
     """The class of the systems with these equations, from names and units in mappings."""
     named = [tuple((name, unit or "") for name, unit in entries.items()) for entries in (states, controls)]
-    return system_class(Definition(equations, named[0], named[1], tuple(parameters), tuple(angles), title))
+    return system_class(Definition(equations, named[0], named[1], tuple(parameters), tuple(angles), title, drawing))
 
 
 def _without_init(definition: Definition) -> EquationSystem:

@@ -154,7 +154,11 @@ def test_a_file_brings_names_units_and_limits(tmp_path):
     found = load_config(config(tmp_path, "urdf", arm()))
     assert found.system.states == {"elbow_pitch": "rad", "elbow_pitch_rate": "rad/s"}
     assert found.system.angles == ["elbow_pitch"]
-    assert build_problem(found).system.title == "robot", "the file's name"
+    system = build_problem(found).system
+    assert system.title == "robot", "the file's name"
+    assert len(system.draw(np.zeros(2), np.zeros(1))) == 1, "the rod"
+    path = config(tmp_path, "urdf", arm(), system={"name": "urdf", "file": "robot.urdf", "drawing": "disk(0, 0, 1)"})
+    assert load_config(path).system.drawing == "disk(0, 0, 1)", "that of the YAML"
     assert (found.controls.lower, found.controls.upper) == ([-5.0], [5.0])
     found = load_config(config(tmp_path, "urdf", arm(), controls={"lower": -1, "upper": 1}))
     assert (found.controls.lower, found.controls.upper) == (-1, 1)

@@ -38,6 +38,10 @@ def evaluate(
         Path | None,
         typer.Option(help="Also in MuJoCo's simulator, on the plant of this MJCF or URDF file.", metavar="FILE.xml"),
     ] = None,
+    animation: Annotated[
+        Path | None,
+        typer.Option(help="With --plant: the first of these closed loops as MuJoCo draws it.", metavar="FILE.gif"),
+    ] = None,
     paths: Annotated[
         int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
     ] = 32,
@@ -57,17 +61,25 @@ def evaluate(
     from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
     from lyapnet.evaluation.in_simulator import read_plant, simulate
     from lyapnet.evaluation.measurement import evaluation
+    from lyapnet.evaluation.movie import require_ending
     from lyapnet.evaluation.robustness import not_varied, robustness
+    from lyapnet.evaluation.simulator_movie import SimulatorMovie, renderer_of
     from lyapnet.evaluation.tables import evaluation_table
 
-    if table is not None and not table.parent.is_dir():
-        raise UsageError(
-            f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
-        )
+    for option, file in (("--table", table), ("--animation", animation)):
+        if file is not None and not file.parent.is_dir():
+            raise UsageError(
+                f"Expected {option} in a folder that exists, got {str(file)!r}; make {str(file.parent)!r} first."
+            )
+    if animation is not None:
+        require_ending(animation)
+        if plant is None:
+            raise UsageError("Expected --plant with --animation, got none; without a plant write lyapnet animate.")
     controller = given.load()
     filtered = estimator_of(controller, outputs or [], estimator, deviation, delay)
     count = min(samples, 64)
-    simulated = None if plant is None else read_plant(plant, controller)
+    simulated = None if plant is None else read_plant(plant, controller, animation is not None)
+    renderer = None if simulated is None or animation is None else renderer_of(simulated)
     if until is not None:
         check_multiple(controller, until, count)
     report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
@@ -89,7 +101,10 @@ def evaluate(
         result["afterwards"] = in_plain_data(later, controller, until)
     if simulated is not None:
         report(f"closed loops in MuJoCo from {count} states")
-        result["simulator"] = simulate(controller, simulated, measured.table.x0[:count]).summary()
+        loops = simulate(controller, simulated, measured.table.x0[:count])
+        result["simulator"] = loops.summary()
+        if renderer is not None and animation is not None:
+            SimulatorMovie(simulated, renderer, loops.positions, controller.horizon.duration).write(animation)
     report.rest()
     if as_json:
         print(json.dumps(result))
@@ -98,6 +113,8 @@ def evaluate(
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
+    if animation is not None:
+        notes.print(f"wrote {animation}", soft_wrap=True)
     if figures is not None:
         report("drawing")
         wrote = _write_figures(figures, controller, measured, later, filtered)

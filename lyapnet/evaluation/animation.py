@@ -1,12 +1,7 @@
 """Animations of closed loops: the system's shapes, or a plane of two states, with controls and cost."""
 
-import io
 import math
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,20 +14,18 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
-from lyapnet.base.errors import UsageError, one_line
-from lyapnet.base.files import write_atomically
 from lyapnet.base.shapes import Shape, corners_of
 from lyapnet.base.types import Value
 from lyapnet.evaluation.figures import Slice
+from lyapnet.evaluation.movie import Movie
 from lyapnet.evaluation.scenes import artist_of, plane_axes, set_plane, set_stage, shapes_of
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.problem import Problem
 
-SHORTEST, LONGEST = 3.0, 10.0  # limits in seconds of the default duration of an animation
 BACKGROUND_OPACITY = 0.18  # opacity of the shapes of all closed loops but the first
 
 
-class Film:
+class Film(Movie):
     """An animation of closed loops, frame by frame.
 
     The left panel shows the system's shapes: those of the first closed loop, faintly those of the others, and in red
@@ -54,18 +47,12 @@ class Film:
     def __init__(
         self, trajectory: Trajectory, problem: Problem, V: Value, rate: float = 20.0, speed: float | None = None
     ):
-        duration = float(trajectory.t[-1])
-        if speed is None:
-            speed = duration / min(max(duration, SHORTEST), LONGEST)
-        for name, value in (("frames per second", rate), ("speed", speed)):
-            if not 0 < value < math.inf:
-                raise UsageError(f"Expected {name} > 0, got {value}; as in 20 frames per second at speed 1.")
-        self.problem, self.V, self.rate, self.speed = problem, V, rate, speed
+        super().__init__(float(trajectory.t[-1]), len(trajectory.t) - 1, rate, speed)
+        self.problem, self.V = problem, V
         self.t, self.x, self.u = (numpy_of(part) for part in (trajectory.t, trajectory.x, trajectory.u))
         self.to_go = numpy_of(trajectory.cost - trajectory.running_cost)
         self.value = numpy_of(trajectory.require_value())
-        count = max(2, round(duration / speed * rate) + 1)
-        self.nodes: list[int] = np.linspace(0, len(self.t) - 1, count).round().astype(int).tolist()
+        self.palette: Image.Image = _palette()
         self.figure = Figure(figsize=(8.6, 4.3), layout="constrained")
         drawn = [self._shapes(node, 0) for node in (0, len(self.u))]
         self._scene = self._stage() if any(drawn) else self._plane() if problem.system.n > 1 else self._course()
@@ -74,7 +61,6 @@ class Film:
         self.figure.set_dpi(110)
 
     def frames(self) -> Iterator[np.ndarray]:
-        """The frames as (height, width, 3) bytes; both sides are even, as video formats require."""
         canvas = self._canvas
         canvas.draw()  # the background, drawn once for all frames
         still = canvas.copy_from_bbox(self.figure.bbox)
@@ -90,50 +76,6 @@ class Film:
                 artist.remove()
             frame = np.array(canvas.buffer_rgba())[..., :3]
             yield frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
-
-    def gif(self) -> bytes:
-        """The animation as a GIF that repeats."""
-        palette = _palette()
-        images = (Image.fromarray(frame) for frame in self.frames())
-        first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-        buffer, pause = io.BytesIO(), 1000 / self.rate
-        pauses = [round(pause)] * len(others) + [1000]  # the last frame is shown for a second
-        first.save(buffer, "GIF", save_all=True, append_images=others, duration=pauses, loop=0, optimize=False)
-        return buffer.getvalue()
-
-    def mp4(self) -> bytes:
-        """The animation as an MP4 video, made by ffmpeg.
-
-        Raises:
-            UsageError: ffmpeg is missing or fails.
-        """
-        program = shutil.which("ffmpeg")
-        if program is None:
-            raise UsageError("Expected ffmpeg for an MP4, got none in PATH; install it, or write a .gif.")
-        frames = self.frames()
-        first = next(frames)
-        size = f"{first.shape[1]}x{first.shape[0]}"
-        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(self.rate), "-i", "-"]
-        with tempfile.TemporaryDirectory() as folder:
-            target = Path(folder, "film.mp4")
-            command = [program, "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(target)]
-            content = b"".join(frame.tobytes() for frame in (first, *frames))
-            made = subprocess.run(command, input=content, capture_output=True)
-            if made.returncode:
-                raise UsageError(f"Expected ffmpeg to make an MP4, got: {one_line(made.stderr.decode())[:200]}.")
-            return target.read_bytes()
-
-    def write(self, path: Path) -> None:
-        """Write the animation atomically to a .gif or .mp4 file.
-
-        Raises:
-            UsageError: the file has another ending, or ffmpeg is missing for an MP4.
-            OSError: the file cannot be written.
-        """
-        makers = {".gif": self.gif, ".mp4": self.mp4}
-        if path.suffix not in makers:
-            raise UsageError(f"Expected a file that ends in .gif or .mp4, got {str(path)!r}; name it so.")
-        write_atomically(path, makers[path.suffix]())
 
     def _shapes(self, node: int, loop: int) -> Sequence[Shape]:
         return shapes_of(self.problem, self.x[node, loop], self.u[min(node, len(self.u) - 1), loop])

@@ -1,6 +1,8 @@
 """Closed loops in MuJoCo's simulator: a controller on a plant with contacts, friction and actuators of its own."""
 
 import math
+import os
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,10 +46,12 @@ class SimulatedLoops(NamedTuple):
     Args:
         cost: ∫ℓ + φ in the simulator with u held for Δt; infinite where it gave up.
         model_cost: the same with the model in continuous time.
+        positions: (N + 1, …) those of all joints of the plant along the first closed loop.
     """
 
     cost: PerState
     model_cost: PerState
+    positions: NDArray
 
     def summary(self) -> dict[str, float]:
         """Mean costs, their ratio, the largest ratio, and the shares of finite loops and of those within AS_GOOD."""
@@ -63,15 +67,20 @@ class SimulatedLoops(NamedTuple):
         }
 
 
-def read_plant(path: Path, controller: Controller) -> Plant:
+def read_plant(path: Path, controller: Controller, drawn: bool = False) -> Plant:
     """The plant of an MJCF or URDF file.
 
     A state is a joint of that name, or JOINT_rate its rate; a control is an actuator, or JOINT_torque and JOINT_force a
     force on a joint.
 
+    Args:
+        drawn: whether MuJoCo is to draw it too, which needs a library that is chosen before MuJoCo is imported.
+
     Raises:
         UsageError: MuJoCo is missing or cannot read the file, or a name is not in it.
     """
+    if drawn and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
+        os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         mujoco: Any = import_module("mujoco")
     except ImportError as error:
@@ -129,6 +138,7 @@ def simulate(controller: Controller, plant: Plant, x0: State) -> SimulatedLoops:
     plant.model.opt.timestep = step = horizon.dt / each
     states = [_started(plant, row) for row in x0.numpy()]
     cost, x = torch.zeros(len(x0), dtype=torch.float64), x0
+    positions = [states[0].qpos.copy()]
     for n in range(horizon.steps):
         like = x.to(controller.initial_states.lower)
         u = controller.controls.applied(like, policy(like.new_tensor(n * horizon.dt), like)).double()
@@ -140,8 +150,9 @@ def simulate(controller: Controller, plant: Plant, x0: State) -> SimulatedLoops:
                 plant.mujoco.mj_step(plant.model, data)
             x = torch.from_numpy(np.stack([_state_of(plant, data, x0.shape[-1]) for data in states]))
             cost += step * (before + problem.cost.running(x, u)) / 2
+        positions.append(states[0].qpos.copy())
     cost = torch.where(cost.isfinite(), cost + problem.cost.terminal(x), torch.inf)
-    return SimulatedLoops(cost, costs_of_plant(problem, policy, x0))
+    return SimulatedLoops(cost, costs_of_plant(problem, policy, x0), np.stack(positions))
 
 
 def _started(plant: Plant, x: NDArray) -> Any:

@@ -12,7 +12,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.shapes import Arrow, Disk, Line, Polygon, chain, corners_of, oblique, rectangle
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
-from lyapnet.evaluation import animation
+from lyapnet.evaluation import movie
 from lyapnet.evaluation.animation import Film
 from lyapnet.evaluation.scenes import set_stage
 from lyapnet.task.systems import (
@@ -186,7 +186,7 @@ def test_a_draw_that_is_wrong_is_named(draw):
 
 
 def test_an_mp4_needs_ffmpeg(monkeypatch, tmp_path):
-    monkeypatch.setattr(animation.shutil, "which", lambda name: None)
+    monkeypatch.setattr(movie.shutil, "which", lambda name: None)
     with pytest.raises(UsageError, match="ffmpeg"):
         film(rate=2).write(tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
@@ -196,7 +196,7 @@ def test_an_mp4_is_what_ffmpeg_makes_of_the_frames(monkeypatch, tmp_path):
     program = tmp_path / "ffmpeg"  # keeps what it is sent, in the place of one that encodes
     program.write_text('#!/bin/sh\nfor last; do :; done\ncat > "$last"\n')
     program.chmod(0o755)
-    monkeypatch.setattr(animation.shutil, "which", lambda name: str(program))
+    monkeypatch.setattr(movie.shutil, "which", lambda name: str(program))
     shown = film(rate=2, speed=0.06)
     shown.write(tmp_path / "a.mp4")
     assert (tmp_path / "a.mp4").stat().st_size == sum(frame.nbytes for frame in shown.frames())

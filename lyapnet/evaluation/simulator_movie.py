@@ -1,0 +1,52 @@
+"""A closed loop in MuJoCo's simulator as MuJoCo draws it."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyapnet.base.errors import UsageError, one_line
+from lyapnet.evaluation.in_simulator import Plant
+from lyapnet.evaluation.movie import Movie
+
+HEIGHT, WIDTH = 480, 640  # pixels, for which MuJoCo has room by default
+
+
+def renderer_of(plant: Plant) -> Any:
+    """MuJoCo's renderer of a plant, without a window.
+
+    Raises:
+        UsageError: there is no library for it.
+    """
+    try:
+        return plant.mujoco.Renderer(plant.model, HEIGHT, WIDTH)
+    except Exception as error:  # of many kinds, one for each library
+        raise UsageError(
+            f"Expected a library by which MuJoCo draws without a window, got none ({one_line(error)[:150]}); set "
+            "MUJOCO_GL=egl or MUJOCO_GL=osmesa and install that, or leave out --animation."
+        ) from error
+
+
+class SimulatorMovie(Movie):
+    """The bodies of a plant along a closed loop, by its first camera, or by MuJoCo's if it has none.
+
+    Args:
+        plant: the MuJoCo model.
+        renderer: of `renderer_of`.
+        positions: (N + 1, …) of all its joints.
+        duration: of the closed loop, in seconds.
+    """
+
+    def __init__(self, plant: Plant, renderer: Any, positions: NDArray, duration: float, rate: float = 20.0):
+        super().__init__(duration, len(positions) - 1, rate, None)
+        self.plant, self.renderer, self.positions = plant, renderer, positions
+
+    def frames(self) -> Iterator[np.ndarray]:
+        mujoco, model = self.plant.mujoco, self.plant.model
+        data, camera = mujoco.MjData(model), 0 if model.ncam else -1
+        for node in self.nodes:
+            data.qpos[:] = self.positions[node]
+            mujoco.mj_forward(model, data)
+            self.renderer.update_scene(data, camera)
+            yield self.renderer.render()

@@ -10,6 +10,7 @@ from lyapnet.base.errors import UsageError, one_line
 from lyapnet.evaluation.in_simulator import Plant
 from lyapnet.evaluation.movie import Movie
 
+BRIGHT = 0.8  # ambient light on boxes of inertia, which MuJoCo draws translucent
 HEIGHT, WIDTH = 480, 640  # pixels, for which MuJoCo has room by default
 
 
@@ -31,6 +32,8 @@ def renderer_of(plant: Plant) -> Any:
 class SimulatorMovie(Movie):
     """The bodies of a plant along a closed loop, by its first camera, or by MuJoCo's if it has none.
 
+    A plant without any shape is drawn as the boxes of its inertias.
+
     Args:
         plant: the MuJoCo model.
         renderer: of `renderer_of`.
@@ -44,9 +47,12 @@ class SimulatorMovie(Movie):
 
     def frames(self) -> Iterator[np.ndarray]:
         mujoco, model = self.plant.mujoco, self.plant.model
-        data, camera = mujoco.MjData(model), 0 if model.ncam else -1
+        data, camera, shown = mujoco.MjData(model), 0 if model.ncam else -1, mujoco.MjvOption()
+        if not model.ngeom:
+            shown.flags[mujoco.mjtVisFlag.mjVIS_INERTIA] = True
+            model.vis.headlight.ambient[:] = BRIGHT
         for node in self.nodes:
             data.qpos[:] = self.positions[node]
             mujoco.mj_forward(model, data)
-            self.renderer.update_scene(data, camera)
+            self.renderer.update_scene(data, camera, shown)
             yield self.renderer.render()

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -130,10 +131,11 @@ class Renderer:
     """Draws the height of the first joint as brightness."""
 
     def __init__(self, *_):
-        self.cameras = []
+        self.cameras, self.of_inertia = [], False
 
-    def update_scene(self, data, camera):
+    def update_scene(self, data, camera, shown):
         self.bright, self.cameras = round(100 * data.qpos[0]), [*self.cameras, camera]
+        self.of_inertia = bool(shown.flags[import_module("mujoco").mjtVisFlag.mjVIS_INERTIA])
 
     def render(self):
         return np.full((4, 6, 3), self.bright, dtype=np.uint8)
@@ -148,9 +150,18 @@ def test_a_movie_shows_these_positions(controller, camera, tmp_path):
     assert shown == [round(100 * float(positions[node, 0])) for node in movie.nodes]
     assert (len(shown), shown[0], shown[-1]) == (31, 0, 200), "2 s are shown in 3"
     assert {*renderer.cameras} == {0 if camera else -1}
+    assert not renderer.of_inertia
     movie.write(tmp_path / "movie.gif")
     with Image.open(tmp_path / "movie.gif") as written:
         assert written.n_frames > 20
+
+
+def test_a_plant_without_shapes_is_drawn_by_its_inertias(controller, tmp_path):
+    mass = '<inertial pos="0 0 0.5" mass="1" diaginertia="0.1 0.1 0.01"/>'
+    drawn = read_plant(plant(tmp_path, re.sub("<geom.*?/>", mass, PENDULUM.format(mass=1, more=""))), controller)
+    renderer = Renderer()
+    assert [*SimulatorMovie(drawn, renderer, np.zeros((41, 1)), 2.0, rate=10).frames()]
+    assert renderer.of_inertia
 
 
 def test_without_a_library_to_draw_a_line_says_so(controller, tmp_path, monkeypatch):

@@ -31,6 +31,9 @@ def identify(
     family: Annotated[
         bool, typer.Option("--family", help="Write the ranges as a family, in the place of randomise.")
     ] = False,
+    with_residual: Annotated[
+        bool, typer.Option("--residual", help="Also fit what the equations lack, r(x), and add it where it is needed.")
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -65,18 +68,23 @@ def identify(
         from lyapnet.lab.identification import identify as find
         from lyapnet.lab.identification import read_measurements, system_of
         from lyapnet.lab.identification.figure import measured_and_fitted
-        from lyapnet.lab.identification.report import identified_yaml
+        from lyapnet.lab.identification.report import identified_yaml, residual_sentences
+        from lyapnet.lab.identification.residual_network import identify_residual, require_equations
 
         resolved = load_config(config, overrides)
         torch.set_num_threads(resolved.training.threads)
         system, _ = system_of(resolved)
+        if with_residual:
+            require_equations(system)
         report("reading data")
         given, held = ([read_measurements(path, system) for path in many] for many in (files, test or []))
         names = [name.strip() for each in parameters or [] for name in each.split(",") if name.strip()]
         found = find(resolved, given, names, held, held_out, report)
+        residual = identify_residual(resolved, given, found, held, held_out, report=report) if with_residual else None
         report("writing")
         key = "family" if family else "randomise"
-        text, note = identified_yaml(config, overrides, resolved, found, target, key, [path.name for path in files])
+        names = [path.name for path in files]
+        text, note = identified_yaml(config, overrides, resolved, found, target, key, names, residual)
         write_atomically(target, text.encode())
         picture = target.with_suffix(".png")
         measured_and_fitted(found).savefig(picture, dpi=150)
@@ -84,17 +92,18 @@ def identify(
     unread = [
         f"{each.name}: columns that are not read: {', '.join(map(repr, each.unread))}" for each in given if each.unread
     ]
-    _tell(found, f"{config.name}, from {', '.join(path.name for path in files)}", [*unread, note], as_json, files)
+    unread += [note, *([] if residual is None else residual_sentences(residual))]
+    _tell(found, f"{config.name}, from {', '.join(path.name for path in files)}", unread, as_json, files, residual)
     notes = Console(stderr=as_json, highlight=False, markup=False)
     notes.print(f"wrote {target} and {picture}", soft_wrap=True)
 
 
-def _tell(found: Any, title: str, notes: list[str], as_json: bool, files: list[Path]) -> None:
+def _tell(found: Any, title: str, notes: list[str], as_json: bool, files: list[Path], residual: Any) -> None:
     """Print tables and sentences, or one JSON object."""
     from lyapnet.lab.identification import report
 
     if as_json:
-        print(json.dumps(report.as_json(found, list(map(str, files))), ensure_ascii=False))
+        print(json.dumps(report.as_json(found, list(map(str, files)), residual), ensure_ascii=False))
         return
     console = Console(highlight=False, markup=False)
     console.print(report.parameter_table(found, title))

@@ -62,6 +62,7 @@ class Fit:
         sigma: standard deviation of each reading, (q,).
         bounds: least and greatest value of each parameter.
         anchor: parameters near which directions stay that readings do not tell; None: p is known, and x₀ is sought.
+        spread: standard deviation of parameters around it; None: ANCHOR times their size.
     """
 
     def __init__(
@@ -70,8 +71,13 @@ class Fit:
         sigma: Float[Array, " q"],
         bounds: tuple[Array, Array],
         anchor: Float[Array, " k"] | None,
+        spread: Float[Array, " k"] | None = None,
     ):
         self.shooting, self.sigma, self.bounds, self.anchor = shooting, sigma, bounds, anchor
+        self._anchored: Array | float = 0.0  # 1/spread
+        if anchor is not None:
+            usual = ANCHOR * np.where(anchor == 0, np.inf, np.abs(anchor))
+            self._anchored = 1 / (usual if spread is None else spread)
         self.k = 0 if anchor is None else shooting.k
         self._start: Point | None = None
         self._last: _Evaluation | None = None
@@ -146,9 +152,8 @@ class Fit:
             jacobian[at, k + i * n : k + (i + 1) * n], jacobian[at, :k] = R[:, :n], R[:, n : n + k]
         if self.anchor is not None:
             rows = np.arange(k)
-            weight = 1 / (ANCHOR * np.where(self.anchor == 0, np.inf, np.abs(self.anchor)))
-            residuals[pieces * width + rows] = weight * (p - self.anchor)
-            jacobian[pieces * width + rows, rows] = weight
+            residuals[pieces * width + rows] = self._anchored * (p - self.anchor)
+            jacobian[pieces * width + rows, rows] = self._anchored
         return residuals, jacobian
 
     def _by_piece(self, rows: Array) -> list[Array]:

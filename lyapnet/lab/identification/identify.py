@@ -55,18 +55,31 @@ def identify(
     """
     with default_dtype(torch.float64):
         system, _ = system_of(config)
-        given, tested = ([_recording(each, system) for each in many] for many in (data, test))
-        share = (0.0 if tested else HELD_OUT) if held_out is None else held_out
-        if not given or not 0 <= share < 1:
-            raise UsageError(
-                f"Expected recordings, and a share in [0, 1) that is held out, got {len(given)} and {share}; give some."
-            )
-        _require_alike([*given, *tested])
-        ends = [len(each) - int(share * len(each)) for each in given]
-        fitted = [each.part(0, end) for each, end in zip(given, ends, strict=True)]
-        tested += [each.part(end, len(each)) for each, end in zip(given, ends, strict=True) if end < len(each)]
-        search = Search(UnknownSystem(config, parameters, given[0].outputs), fitted, report)
+        fitted, tested = split_recordings(system, data, test, held_out)
+        search = Search(UnknownSystem(config, parameters, fitted[0].outputs), fitted, report)
         return _conclude(search, *search.run(), tested)
+
+
+def split_recordings(
+    system: ControlSystem,
+    data: Sequence[str | Path | Measurements],
+    test: Sequence[str | Path | Measurements],
+    held_out: float | None,
+) -> tuple[list[Measurements], list[Measurements]]:
+    """The recordings that are fitted, and those that are held out, as of `identify`."""
+    given, tested = ([_recording(each, system) for each in many] for many in (data, test))
+    share = (0.0 if tested else HELD_OUT) if held_out is None else held_out
+    if not given or not 0 <= share < 1:
+        raise UsageError(
+            f"Expected recordings, and a share in [0, 1) that is held out, got {len(given)} and {share}; give some."
+        )
+    _require_alike([*given, *tested])
+    ends = [len(each) - int(share * len(each)) for each in given]
+    fitted = [each.part(0, end) for each, end in zip(given, ends, strict=True)]
+    return fitted, [
+        *tested,
+        *(each.part(end, len(each)) for each, end in zip(given, ends, strict=True) if end < len(each)),
+    ]
 
 
 def _recording(given: str | Path | Measurements, system: ControlSystem) -> Measurements:
@@ -87,7 +100,7 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
     """What a minimum says."""
     sigma, names, recordings = search.noise(found), search.readings.names, search.recordings
     freedom = int(found.residuals.size - np.round(found.leverage.sum()))
-    fitted, later = _curves(fit, found, held_out=False), _held_out(search, fit, found, tested)
+    fitted, later = _curves(fit, found, held_out=False), held_out_curves(search, fit, found, tested)
     residuals = np.split(found.residuals, np.cumsum([len(each) for each in recordings])[:-1])
     tests = [
         examine(
@@ -113,6 +126,8 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
         units=dict(zip(names, search.readings.units, strict=True)),
         freedom=freedom,
         pieces=len(fit.shooting.pieces),
+        states=found.path.nodes,
+        controls=np.concatenate([piece.u[::SEGMENT] for piece in fit.shooting.pieces]),
     )
 
 
@@ -136,7 +151,7 @@ def _estimates(search: Search, found: Solution, confidence: Confidence, freedom:
     }
 
 
-def _held_out(search: Search, fit: Fit, found: Solution, tested: Sequence[Measurements]) -> list[Curve]:
+def held_out_curves(search: Search, fit: Fit, found: Solution, tested: Sequence[Measurements]) -> list[Curve]:
     """The model beside recordings that were not fitted, from initial states that are; none if it follows none."""
     pieces, longest = fit.shooting.pieces, max((len(each) for each in tested), default=0)
     cut = len(pieces) > len(search.recordings)  # the model forgets where it began, or is lost: here too

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lyapnet.base.files import plain
 from lyapnet.experiment.assembly.family import members_of
 from lyapnet.experiment.config import Config, config_from_plain
 from lyapnet.experiment.schema import read_yaml
+from lyapnet.lab.identification.residual_network import Residual
 from lyapnet.lab.identification.residuals import LEVEL, ResidualTest
 from lyapnet.lab.identification.results import Estimate, Identification
 from lyapnet.lab.identification.unknown_system import system_of
@@ -89,6 +91,45 @@ def sentences(found: Identification) -> list[str]:
     return told
 
 
+def residual_sentences(residual: Residual) -> list[str]:
+    """Whether what the model lacks is told by these data, how large it is, and how steep."""
+    if not residual.before or math.isnan(residual.ratio):
+        return ["r(x) is left out: nothing was held out to judge it by, or nothing of it is followed; hold some out."]
+    pairs = [f"{name} {residual.before[name]:.3g} → {residual.after[name]:.3g}" for name in residual.before]
+    told = f"with r(x) errors on held-out data are {residual.ratio:.2g} times as large ({', '.join(pairs)})"
+    if not residual.needed:
+        return [f"r(x) is not needed, and left out: {told}."]
+    network, (largest, slopes) = residual.network, residual.network.bounds()
+    lines = [f"r(x) is needed: {told}."]
+    for k, i in enumerate(network.rates):
+        each = ", ".join(f"{name} {slope:.3g}" for name, slope in zip(network.states, slopes[k], strict=True))
+        lines.append(
+            f"r of {network.states[i]}: at most {largest[k]:.3g} on the box of these data, its slopes at most {each}; "
+            f"beyond the box it is a guess, at most {network.everywhere[k]:.3g}."
+        )
+    return lines
+
+
+def _residual_as_data(residual: Residual) -> dict[str, Any]:
+    """What r(x) brings, and its bounds."""
+    network, (largest, slopes) = residual.network, residual.network.bounds()
+    names = [network.states[i] for i in network.rates]
+    return {
+        "needed": residual.needed,
+        "ratio": None if math.isnan(residual.ratio) else residual.ratio,
+        "held_out_before": residual.before,
+        "held_out_after": residual.after,
+        "box": {
+            name: [float(c - w), float(c + w)]
+            for name, c, w in zip(network.states, network.center, network.width, strict=True)
+        },
+        "largest": dict(zip(names, largest.tolist(), strict=True)),
+        "slopes": {
+            name: dict(zip(network.states, row, strict=True)) for name, row in zip(names, slopes.tolist(), strict=True)
+        },
+    }
+
+
 def _in_percent(direction: Mapping[str, float]) -> dict[str, float]:
     """A direction with a smallest change of one percent, and no change above ten."""
     sizes = [abs(change) for change in direction.values()]
@@ -121,7 +162,7 @@ def rounded_interval(low: float, high: float) -> tuple[float, float]:
     return float(f"{math.floor(low / unit) * unit:.12g}"), float(f"{math.ceil(high / unit) * unit:.12g}")
 
 
-def as_json(found: Identification, files: Sequence[str]) -> dict[str, Any]:
+def as_json(found: Identification, files: Sequence[str], residual: Residual | None = None) -> dict[str, Any]:
     """Everything but the curves as plain data."""
     return plain(
         {
@@ -136,6 +177,7 @@ def as_json(found: Identification, files: Sequence[str]) -> dict[str, Any]:
             "model_is_right": found.model_is_right,
             "pieces": found.pieces,
             "degrees_of_freedom": found.freedom,
+            **({} if residual is None else {"residual": _residual_as_data(residual)}),
         }
     )
 
@@ -148,6 +190,7 @@ def identified_yaml(
     out: Path,
     key: str,
     files: Sequence[str],
+    residual: Residual | None = None,
 ) -> tuple[str, str]:
     """The config with the estimates and their ranges as YAML, and what is to be said of these ranges.
 
@@ -155,6 +198,7 @@ def identified_yaml(
         path: of the config.
         key: randomise or family, which gets the ranges.
         files: names of the data.
+        residual: what is added to the equations, if it is needed.
     """
     told = {name: one for name, one in found.parameters.items() if one.told}
     ranges = {name: [*rounded_interval(one.low, one.high)] for name, one in told.items()}
@@ -163,6 +207,12 @@ def identified_yaml(
     layers = OmegaConf.create(read_yaml(path, Config)), OmegaConf.from_dotlist(list(overrides))
     content: Any = OmegaConf.to_container(OmegaConf.merge(*layers))
     content["experiment"] = f"{config.experiment}_identified"
+    added = residual is not None and residual.needed
+    if residual is not None and added:
+        system = asdict(residual.config.system)
+        content["system"] = {name: value for name, value in system.items() if value}
+        limits = {"lower": config.controls.lower, "upper": config.controls.upper}  # of a model's file
+        content.setdefault("controls", {name: value for name, value in limits.items() if value is not None})
     content.setdefault("system", {})["parameters"] = {**config.system.parameters, **values}
     others = {name: ends for name, ends in config.family.items() if name not in found.parameters}
     refused = _refusal(config, values, ranges, key, others)
@@ -182,13 +232,24 @@ def identified_yaml(
             if found.model_is_right
             else ["The model does not explain these data: intervals count what is left as coloured noise."]
         ),
+        *(residual_sentences(residual) if residual is not None and added else []),
         *([f"{key}: {_in_a_line(ranges)}"] if refused and ranges else []),
     ]
     config_from_plain(content)  # raises what would be refused later
-    text = "".join(f"# {' '.join(line.split())}\n" for line in comments) + yaml.safe_dump(
-        content, default_flow_style=None, sort_keys=False, allow_unicode=True, width=WIDTH
+    text = "".join(f"# {' '.join(line.split())}\n" for line in comments) + yaml.dump(
+        content, Dumper=_LineByLine, default_flow_style=None, sort_keys=False, allow_unicode=True, width=WIDTH
     )
     return text, note
+
+
+class _LineByLine(yaml.SafeDumper):
+    """Writes texts of several lines as such."""
+
+
+_LineByLine.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None),
+)
 
 
 def _in_a_line(content: Any) -> str:

@@ -64,6 +64,7 @@ class Identification:
         units: of the readings.
         freedom: readings without unknowns.
         pieces: how many, each from a state of its own.
+        states, controls: some of those along what was fitted, (segments, n) and (segments, m).
     """
 
     parameters: dict[str, Estimate]
@@ -77,6 +78,8 @@ class Identification:
     units: dict[str, str]
     freedom: int
     pieces: int
+    states: Float[Array, "segments n"]
+    controls: Float[Array, "segments m"]
 
     @property
     def values(self) -> dict[str, float]:

@@ -95,7 +95,11 @@ class Search:
             start = self.start(shooting, self.unknown.before)
             if shooting(start.p, start.x0, start.nodes) is not None:
                 sigma = np.where(np.isnan(self.known), self._first_noise(), self.known)
-                return Fit(shooting, sigma, self.bounds, self.unknown.before), count * SEGMENT, start
+                return (
+                    Fit(shooting, sigma, self.bounds, self.unknown.before, self.unknown.spread),
+                    count * SEGMENT,
+                    start,
+                )
             count //= 2
         raise LyapnetError(
             f"Expected data that the config's model can follow for {SEGMENT} samples, got others; {START_BETTER}."
@@ -137,7 +141,7 @@ class Search:
             pieces.append(recording.part(begin, len(recording)))
         shooting = self.shooting(pieces, fit.shooting.substeps)
         start = Point(found.point.p, nodes[shooting.first], nodes)
-        return Fit(shooting, self.noise(found), self.bounds, self.unknown.before), start
+        return Fit(shooting, self.noise(found), self.bounds, self.unknown.before, self.unknown.spread), start
 
     # Noise
 
@@ -172,7 +176,7 @@ class Search:
                 shooting = self.shooting(shooting.pieces, 2 * shooting.substeps)
             elif (np.abs(sigma / fit.sigma - 1) < SETTLED).all():
                 break
-            fit = Fit(shooting, sigma, self.bounds, self.unknown.before)
+            fit = Fit(shooting, sigma, self.bounds, self.unknown.before, self.unknown.spread)
         return fit, found
 
     def _known_noise(self) -> Array:

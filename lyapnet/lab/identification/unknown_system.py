@@ -68,13 +68,15 @@ class UnknownSystem:
         config: the system, and X₀.
         names: of the parameters; none: see `sought_parameters`.
         outputs: names of the readings.
+        spread: standard deviations of the parameters around their values in the config; None: so large that they hardly
+            count.
 
     Raises:
         UsageError: a parameter is none, or f and g do not read it as they have to.
     """
 
-    def __init__(self, config: Config, names: Sequence[str], outputs: Sequence[str]):
-        self.config = config
+    def __init__(self, config: Config, names: Sequence[str], outputs: Sequence[str], spread: np.ndarray | None = None):
+        self.config, self.spread = config, spread
         self.system, self.box = system_of(config)
         before = sought_parameters(config, self.system, names)
         self.names, self.before = list(before), np.array([*before.values()])

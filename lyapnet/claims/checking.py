@@ -16,7 +16,7 @@ from lyapnet.base.files import plain
 from lyapnet.base.types import State
 from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
-from lyapnet.claims.funnel import prove_funnel
+from lyapnet.claims.funnel import before_last_step, prove_funnel
 from lyapnet.claims.kept_regions import kept_region
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.noisy_certificate import NoisyCertificate
@@ -28,6 +28,7 @@ from lyapnet.claims.reach_certificate import ReachCertificate
 from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
+from lyapnet.claims.stepped_decrease import SteppedPayment
 from lyapnet.claims.two_sided import TwoSidedCertificate, labels_of_both
 from lyapnet.controller.controller import Controller
 from lyapnet.prover.branch_and_bound import Budget
@@ -122,6 +123,7 @@ class KeptSide(NamedTuple):
     states: Box  # D; of width 0 along ignorable states
     disturbance: State | None
     readings: Readings | None
+    steps: bool  # whether it is about the steps of the model
     degree: int  # of the Taylor forms
     rho: float
     seconds: float  # of the original search
@@ -149,18 +151,24 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
         if of["degree"] not in (2, DEGREE):
             raise ValueError("forms of unknown degree")
         kept = KeptSide(
-            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, readings, int(of["degree"]),
+            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, readings, "steps" in of, int(of["degree"]),
             float(content["proved"]), float(content["seconds"]),
         )  # fmt: skip
     loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
     if name == "below":
         condition = RiseCondition(loop, kept.alpha, kept.delta, problem)
+    elif kept.steps:
+        condition = SteppedPayment(loop, kept.alpha, kept.delta, problem)
     else:
         condition = DecreaseCondition(
             loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance, kept.readings
         )
     if kept.states.dimension == controller.system.n:  # otherwise the claim raises the error
         domain = over_time(kept.states, controller.horizon.duration)
+        if isinstance(condition, SteppedPayment):
+            seen = [i for i in range(controller.system.n) if kept.states.widths[i] > 0]
+            condition.keep_within(kept.states, [i for i in seen if i not in controller.system.constants])
+            domain = before_last_step(controller.horizon, kept.states)
         box = condition.search_box(domain)
         KeptProof(path, about(bounded_condition(condition, domain, kept.degree), condition, *box), math.inf).claim(box)
     return kept
@@ -172,7 +180,7 @@ def _reprove_funnel(
     kept = kept_funnel(controller, path)
     claim = prove_funnel(
         controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
-        path, True, kept.degree, kept.disturbance, kept.readings, law,
+        path, True, kept.degree, kept.disturbance, kept.readings, law, kept.steps,
     )  # fmt: skip
     reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or the funnel misses some of X₀"
     return Checked(_stated(SoundCertificate(controller, claim, {})), reason, claim.proof_seconds, kept.seconds)
@@ -225,7 +233,7 @@ def _reprove_region(controller: Controller, path: Path, budget: Budget, report: 
     plants = plants_of(controller, kept.parameters) if kept.parameters else None
     claim = prove_region(
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
-        kept.disturbance, plants, kept.readings,
+        kept.disturbance, plants, kept.readings, kept.steps is not None,
     )  # fmt: skip
     reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is above the level of the proof"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds

@@ -215,11 +215,13 @@ def check_disturbance(value: Any) -> None:
 def check_reading(value: Any) -> None:
     """Refuse a value that is no name of a way to read a law."""
     if value not in READ_AT:
-        raise UsageError(f"Expected time as {' or '.join(READ_AT)}, got {value!r}; name one of them.")
+        raise UsageError(
+            f"Expected time as {', '.join(READ_AT[:-1])} or {READ_AT[-1]}, got {value!r}; name one of them."
+        )
 
 
-READ_AT = ("continuous", "held")
-"""When u is read: at every t, or at times at most Δt apart, and held between them."""
+READ_AT = ("continuous", "held", "steps")
+"""When u is read: at every t; at times at most Δt apart, and held between them; or in each step of the model."""
 
 
 def check_errors(value: Any) -> None:
@@ -332,7 +334,8 @@ class ReadAtTimes(Claim):
     """A claim about u read at every t, or at times and held between them, with a delay and errors."""
 
     time: str | None = option(
-        None, "When u is read: continuous, at every t; or held, each Δt.", metavar="WHEN", check=check_reading
+        None, "When u is read: continuous, at every t; held, each Δt; or steps, a claim about steps of the model.",
+        metavar="WHEN", check=check_reading,
     )  # fmt: skip
     interval: float | None = option(
         None, "Seconds between two readings of u; Δt if none.", above=0, remedy="give it in s"

@@ -9,10 +9,10 @@ from operator import itemgetter
 
 import numpy as np
 import torch
-from scipy.linalg import solve_continuous_lyapunov
+from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 from torch import Tensor
 
-from lyapnet.base.types import PerState, State, Time
+from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.claims.preconditions import append_constants, at_time, first_states, over_time
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
@@ -20,6 +20,7 @@ from lyapnet.prover.boxes import pieces
 from lyapnet.prover.branch_and_bound import Budget, minimum
 from lyapnet.prover.branches import decisions
 from lyapnet.prover.rounding import rounding
+from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import gradients
 
@@ -42,6 +43,12 @@ class Contraction:
     By the mean value theorem on the segment between them, ‖Y(x − x')‖ falls at the rate κ for any two closed loops in
     B. Those of a set that none leaves therefore converge to one equilibrium x_e in B, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
 
+    For steps x⁺ = x + Δt F(x), F is the mean rate of a step, and
+
+        ½(P J + JᵀP) + ½Δt JᵀPJ ≤ −κP,
+
+    so that ‖Y(x − x')‖ falls by the factor 1 − κΔt in each step: with M = YJY⁻¹, ‖1 + ΔtM‖² ≤ 1 − 2κΔt ≤ (1 − κΔt)².
+
     For plants ẋ = F(x; p), p ∈ P, the inequality holds for every p with the same Y. Each plant has its own equilibrium
     x_e(p), and the bound uses the largest ‖Y F(x*; p)‖.
 
@@ -55,11 +62,21 @@ class Contraction:
     fingerprint: str  # of the traced F and its Jacobian
 
 
-class _Law:
-    """F(x) in real arithmetic. At one x it runs the traced operations, to be differentiated; on a batch, the code."""
+def rate_of(loop: ClosedLoop, steps: Problem | None, x: State, u: Control) -> State:
+    """f + gu; or its mean over one step with u held."""
+    return loop.system.dynamics(x, u) if steps is None else steps.smooth_rates(x, u)[0]
 
-    def __init__(self, loop: ClosedLoop, states: Box):
+
+class _Law:
+    """F(x) in real arithmetic. At one x it runs the traced operations, to be differentiated; on a batch, the code.
+
+    Args:
+        steps: gives the steps of which F is the mean rate; None: F = f + gu.
+    """
+
+    def __init__(self, loop: ClosedLoop, states: Box, steps: Problem | None):
         self.loop, self.domain, self.constants = loop, over_time(states, 0.0), loop.system.constants
+        self.steps, self.dt = steps, 0.0 if steps is None else steps.horizon.dt
         self.bounded = BoundedFunction(lambda t, x: (self._slope(t, x),), self.domain, exact=True)
         branches = decisions(self.bounded.graph)
         self.decisions = None if branches is None else BoundedFunction(branches, self.domain)
@@ -72,7 +89,7 @@ class _Law:
         return all(bool((high - low < 0.5).all()) for low, high in bounds)
 
     def _slope(self, t: Time, x: State) -> State:
-        return self.loop.system.dynamics(x, self.loop.policy(t, x))
+        return rate_of(self.loop, self.steps, x, self.loop.policy(t, x))
 
     def __call__(self, t: Time, x: State) -> State:
         return self.bounded.graph(t, x)[0] if x.ndim == 1 else self._slope(t, x)
@@ -103,13 +120,16 @@ class _Coordinates:
         self.bounded = BoundedFunction(lambda t, x: (self.rate(t, x),) * 2, law.domain)
 
     def rate(self, t: Time, x: State) -> PerState:
-        """A lower bound of the least eigenvalue of S = −½(ZᵀPJZ + its transpose), where Z ≈ Y⁻¹.
+        """A lower bound of the least eigenvalue of S = −½Zᵀ(PJ + JᵀP + ΔtJᵀPJ)Z, where Z ≈ Y⁻¹.
 
         It uses Gershgorin's discs. For several plants, where Y cannot make every S diagonal, it also uses Brauer's
         ovals, which are tighter.
         """
-        M = self.Z.mT @ (self.Y.mT @ (self.Y @ (self.law.jacobian(t, x, self.seen) @ self.Z)))
-        S, rows = -(M + M.mT) / 2, range(len(self.seen))
+        N = self.Y @ (self.law.jacobian(t, x, self.seen) @ self.Z)
+        M, rows = self.Z.mT @ (self.Y.mT @ N), range(len(self.seen))
+        S = -(M + M.mT) / 2
+        if self.law.dt:
+            S = S - self.law.dt / 2 * N.mT @ N
         radii = [sum((S[..., i, j].abs() for j in rows if j != i), 0 * S[..., i, i]) for i in rows]
         discs = reduce(torch.minimum, [S[..., i, i] - radii[i] for i in rows])
         if len(rows) == 1 or not self.law.constants:
@@ -161,6 +181,7 @@ def contraction_around(
     seen: Sequence[int],
     seconds: float = 60.0,
     proposed: tuple[Box, Tensor] | None = None,
+    steps: Problem | None = None,
 ) -> tuple[Contraction | None, float]:
     """Find the largest box around the goal on which the law contracts, among boxes in the shape of D.
 
@@ -169,22 +190,28 @@ def contraction_around(
         seen: the indices of the states that the law depends on, without constants.
         seconds: the time limit.
         proposed: the only (B, Y) to test, for example from a file; the test assumes nothing about them.
+        steps: gives the steps that are to contract, with u held; None: continuous time.
 
     Returns:
         (contraction, slowest): the contraction, or None if the linearised law is unstable or contracts on no tested
-        box; and the largest real part among the eigenvalues of the linearised law, in 1/s.
+        box; and the largest Re μ + ½Δt|μ|² among the eigenvalues μ of the linearised law, in 1/s, with Δt = 0 in
+        continuous time. Steps with |1 + Δtμ| < 1 have a negative one.
     """
-    law, reach, budget = _Law(loop, states), torch.minimum(goal - states.lower, states.upper - goal), Budget(seconds)
+    law, reach, budget = (
+        _Law(loop, states, steps),
+        torch.minimum(goal - states.lower, states.upper - goal),
+        Budget(seconds),
+    )
     A, *others = law.linearised(goal, states, seen)
-    slowest = float(np.max([_largest_real_part(each) for each in (A, *others)]))  # nan if one of them is nan
+    slowest = float(np.max([_slowest(each, law.dt) for each in (A, *others)]))  # nan if one of them is nan
     own, found = -slowest / 2, None
     if not own > 0:
         return None, slowest
     scale = reach[list(seen)].numpy()
     try:
         metrics = [] if proposed else _candidate_metrics(law, A, goal, seen, scale, own)
-        Ys = [proposed[1]] if proposed else [_coordinates_of(P, A, scale) for P in metrics]
-        at_goal, Y = max(((_rate_of_linear_laws(Y, (A, *others)), Y) for Y in Ys), key=itemgetter(0))
+        Ys = [proposed[1]] if proposed else [_coordinates_of(P, A, scale, law.dt) for P in metrics]
+        at_goal, Y = max(((_rate_of_linear_laws(Y, (A, *others), law.dt), Y) for Y in Ys), key=itemgetter(0))
         coordinates = _Coordinates(law, goal, states, seen, Y, min(LEAST * own, at_goal / 2))
     except np.linalg.LinAlgError:
         return None, slowest
@@ -204,22 +231,30 @@ def contraction_around(
     return found, slowest
 
 
-def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Box, seen: Sequence[int]) -> float:
+def distance_left(
+    loop: ClosedLoop,
+    around: Contraction,
+    goal: State,
+    states: Box,
+    seen: Sequence[int],
+    steps: Problem | None = None,
+) -> float:
     """An upper bound of the distance from the goal as t → ∞, where u is rounded: ẋ = F̂(x) instead of F(x).
 
-    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖. As t → ∞ the closed loop therefore comes into the ball of
-    radius R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The supremum over a box around that ball gives a smaller
-    ball, and so on. The bound is R/σ plus the distance of x_e, where σ is the least singular value of Y.
+    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖; for steps, their difference quotient is so bounded. As t → ∞
+    the closed loop therefore comes into the ball of radius R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The
+    supremum over a box around that ball gives a smaller ball, and so on. The bound is R/σ plus the distance of x_e,
+    where σ is the least singular value of Y.
 
     Args:
         around: the contraction of F; B holds a set that no closed loop of F̂ leaves.
-        goal, states, seen: as of contraction_around.
+        goal, states, seen, steps: as of contraction_around.
     """
 
     def error(t: Time, x: State) -> tuple[State]:
-        rounded = loop.system.dynamics(x, loop.policy(t, x))
+        rounded = rate_of(loop, steps, x, loop.policy(t, x))
         with rounding(counted=False):
-            return (rounded - loop.system.dynamics(x, loop.policy(t, x)),)
+            return (rounded - rate_of(loop, steps, x, loop.policy(t, x)),)
 
     bounded, n, Y = BoundedFunction(error, over_time(states, 0.0)), around.box.dimension, around.coordinates
     chosen, box, radius = list(seen), around.box, math.inf
@@ -243,9 +278,12 @@ def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Bo
     return min(left, float(torch.linalg.vector_norm(around.box.reach_from(goal[:n]))))
 
 
-def _largest_real_part(A: np.ndarray) -> float:
-    """The largest real part among the eigenvalues; nan if A is not finite."""
-    return float(np.linalg.eigvals(A).real.max()) if np.isfinite(A).all() else math.nan
+def _slowest(A: np.ndarray, dt: float) -> float:
+    """The largest Re μ + ½Δt|μ|² among the eigenvalues μ; nan if A is not finite."""
+    if not np.isfinite(A).all():
+        return math.nan
+    mu = np.linalg.eigvals(A)
+    return float((mu.real + dt / 2 * np.abs(mu) ** 2).max())
 
 
 def _is_around(box: Box, goal: State, states: Box, least: State) -> bool:
@@ -273,7 +311,11 @@ def _candidate_metrics(
         raise np.linalg.LinAlgError("Expected a finite linearised law in units of D, got infinite entries.")
     with warnings.catch_warnings():  # about rounding: each P is tested before it is used
         warnings.simplefilter("ignore")
-        found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
+        if law.dt:
+            step = (eye + law.dt * scaled) / math.sqrt(1 - 2 * own * law.dt)
+            found = [solve_discrete_lyapunov(step.T, law.dt * eye)]
+        else:
+            found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
     if law.constants and law.loop.V is not None:
         t, V, chosen = goal.new_zeros(()), law.loop.V, list(seen)
         H = torch.autograd.functional.hessian(lambda x: V(t, x), goal)[chosen][:, chosen].numpy()  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -282,19 +324,19 @@ def _candidate_metrics(
     return found
 
 
-def _coordinates_of(P: np.ndarray, A: np.ndarray, scale: np.ndarray) -> Tensor:
-    """Y in unscaled states with YᵀY = P and ½(M + Mᵀ) diagonal, where M = Y A Y⁻¹.
+def _coordinates_of(P: np.ndarray, A: np.ndarray, scale: np.ndarray, dt: float) -> Tensor:
+    """Y in unscaled states with YᵀY = P and M + Mᵀ + Δt MᵀM diagonal, where M = Y A Y⁻¹.
 
     Raises:
         LinAlgError: P is not positive definite.
     """
     L = np.linalg.cholesky((P + P.T) / 2)
     M = L.T @ (A * scale / scale[:, None]) @ np.linalg.inv(L.T)
-    _, turn = np.linalg.eigh((M + M.T) / 2)
+    _, turn = np.linalg.eigh((M + M.T + dt * M.T @ M) / 2)
     return torch.from_numpy(turn.T @ L.T / scale)
 
 
-def _rate_of_linear_laws(Y: Tensor, laws: Sequence[np.ndarray]) -> float:
+def _rate_of_linear_laws(Y: Tensor, laws: Sequence[np.ndarray], dt: float) -> float:
     """The rate at which all of some linear laws contract in coordinates Y.
 
     Raises:
@@ -302,7 +344,7 @@ def _rate_of_linear_laws(Y: Tensor, laws: Sequence[np.ndarray]) -> float:
     """
     Z = _inverse(Y, len(laws[0])).numpy()
     parts = [Y.numpy() @ A @ Z for A in laws]
-    return -max(float(np.linalg.eigvalsh(M + M.T).max()) / 2 for M in parts)
+    return -max(float(np.linalg.eigvalsh(M + M.T + dt * M.T @ M).max()) / 2 for M in parts)
 
 
 def _inverse(Y: Tensor, k: int) -> Tensor:

@@ -25,6 +25,7 @@ from lyapnet.claims.preconditions import (
     require_continuous,
     slice_at_zero,
 )
+from lyapnet.claims.stepped_decrease import SteppedPayment
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum, share_below
@@ -39,6 +40,7 @@ from lyapnet.prover.proof import Progress, Proof, prove, tell
 from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
 from lyapnet.task.constraints import names_of
+from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
@@ -47,6 +49,7 @@ LEVELS = 60.0  # seconds at most
 LEAST = 1.0  # seconds at least
 SHARE_OF_LEVELS = 0.3  # share of the remaining budget
 SHARE_OF_FINISH = 0.15  # share of the remaining budget that is reserved for the share of X₀ and κ
+NODE = 1e-9  # of Δt, by which the time of the last step may be off by rounding
 KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command resumes it."
 NOT_KEPT = "Stopped while certifying: the proof is lost; the option keep writes it to a file."
 
@@ -72,6 +75,14 @@ class ProvedFunnel:
     With `readings` the law is not read at every t. Then the inequality holds at t = t̂ + a and x = x(t̂ + a) for the
     control u of each reading at (t̂, x̂) with W(t̂, x̂) ≤ ρ, as long as it may be in use (see Readings). By induction over
     the readings the same follows, whatever their times are.
+
+    With `steps` all of this is about the steps x_{n+1} = F(x_n, u) of the horizon's method, with u = policy(t_n, x_n)
+    held, and nothing about the time between them. At each t ∈ [0, T − Δt] and x ∈ D with W ≤ ρ
+
+        (V(t + Δt, F(x, u)) − V(t, x))/Δt + α ℓ̄(x, u) ≤ δ     and     F(x, u) ∈ D,
+
+    where ℓ̄ is the mean of ℓ over the step: at each of the times t_n, and between them too. By induction x_n ∈ D and
+    V(t_n, x_n) ≤ ρ + δt_n, and J is the cost of the steps. {W ≤ ρ} may touch the boundary of D.
 
     The verdict is about the funnel of ρ = `wanted`, which contains all of X₀. For every verdict, `rho` is the largest
     proved level, and {V(0, ·) ≤ rho} contains the share `volume_share` of X₀.
@@ -101,6 +112,7 @@ class ProvedFunnel:
     set_up: float = 0.0  # seconds of the budget before the first box
     assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
     readings: Readings | None = None  # when u is read; None: at every t
+    steps: Horizon | None = None  # Δt and method of the steps; None: continuous time
     formula: ClassVar[str] = "ρ + δt"  # of `level`, for figures
 
     def level(self, t: float) -> float:
@@ -149,6 +161,7 @@ def prove_funnel(
     disturbance: State | None = None,
     readings: Readings | None = None,
     law: FloatLaw | None = None,
+    steps: bool = False,
 ) -> ProvedFunnel:
     """Prove the largest funnel that a budget allows, up to the one that contains X₀.
 
@@ -160,6 +173,7 @@ def prove_funnel(
         disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
         readings: when u is read; None: at every t.
         law: a program that computes u in floating-point numbers, whose errors count; None: u is exact.
+        steps: whether the claim is about the steps of the horizon's method, without any of the three before it.
 
     Raises:
         UsageError: α, δ or D are unsuitable; readings are of another program; an operator has no bound.
@@ -168,10 +182,13 @@ def prove_funnel(
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if disturbance is not None:
         _require_usable_disturbance(disturbance, problem)
-    condition = DecreaseCondition(
-        copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance, readings
-    )
-    duration = problem.horizon.duration
+    loop, duration = copied(closed_loop).requires_grad_(False), problem.horizon.duration
+    if steps:
+        if problem.constraints is not None:
+            raise UsageError("Expected no state constraints with --time steps, got some; take --time continuous.")
+        condition = SteppedPayment(loop, alpha, delta, problem)
+    else:
+        condition = DecreaseCondition(loop, alpha, delta, problem.constraints, disturbance, readings)
     left_out, initial_states, wanted, D, domain, sides, levels, assumed = find_setting(
         condition, problem, duration, states, budget, report
     )
@@ -181,7 +198,11 @@ def prove_funnel(
     levels = levels if law is None else budget_for_level(budget)  # its time runs from its construction
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
-    rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
+    rim = float("inf") if steps else minimum(condition.height, *sides, levels, enough=just_above(needed))
+    if isinstance(condition, SteppedPayment):
+        seen = [i for i in range(D.dimension) if i not in (*left_out, *loop.system.constants)]
+        condition.keep_within(D, seen)
+        domain = before_last_step(problem.horizon, D)
     begin = beginning_level(condition, at_time(0.0, x_low, x_high), budget_for_level(budget), just_above(needed))
     crossing = min(begin, crossing_level(condition, domain, budget_for_level(budget), just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
@@ -205,8 +226,13 @@ def prove_funnel(
         remaining_volume=proof.remaining_volume, undecided=proof.undecided, left_out=left_out,
         fingerprint=proof.fingerprint, proof_seconds=proof.seconds, constraints=names, crossing=crossing,
         violation=violation, disturbance=disturbance, set_up=spent, assumed=assumed,
-        readings=readings,
+        readings=readings, steps=problem.horizon if steps else None,
     )  # fmt: skip
+
+
+def before_last_step(horizon: Horizon, states: Box) -> tuple[Corner, Corner]:
+    """[0, T − Δt] × D, or slightly more for the rounding of T − Δt."""
+    return over_time(states, horizon.duration - horizon.dt * (1 - NODE))
 
 
 def require_disturbance(w: State, n: int) -> None:

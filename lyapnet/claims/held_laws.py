@@ -30,9 +30,9 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
     given = [name for name in names if getattr(claim, name, None)]
     refused = _reason_against(problem)
     time = claim.time or ("held" if given or (made_for == "held" and refused is None) else "continuous")
-    if time == "continuous":
+    if time != "held":
         if given:
-            raise UsageError(f"Expected --time held with --{given[0]}, got continuous; u is then read at every t.")
+            raise UsageError(f"Expected --time held with --{given[0]}, got {time}; {READ_THEN[time]}.")
         return None
     if refused is not None:
         raise UsageError(refused)
@@ -48,6 +48,10 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
     rounding = tuple(steps.get(name, 0.0) / 2 for name in system.control_names)
     duration = None if forever else problem.horizon.duration
     return Readings(round((1 + claim.jitter) * interval, 12), claim.delay, tuple(errors), rounding, duration)
+
+
+READ_THEN = {"continuous": "u is then read at every t", "steps": "u is then read in each step of the model"}
+"""When u is read where it is no held law."""
 
 
 def _reason_against(problem: Problem) -> str | None:

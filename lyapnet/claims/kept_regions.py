@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,15 +29,22 @@ class KeptRegion(NamedTuple):
     contracting: tuple[Box, Tensor] | None  # (B, Y); None with a disturbance or readings
     disturbance: State | None  # w
     readings: Readings | None  # when u is read; None: at every t
+    steps: dict[str, Any] | None  # Δt and method of the steps; None: continuous time
     hole: float  # c
     wanted: float  # the level up to which the proof searched
     rho: float  # the proved level, as recorded
     seconds: float  # of the search
 
     def require(
-        self, decay: float, disturbance: State | None, n: int, parameters: Sequence[str], readings: Readings | None
+        self,
+        decay: float,
+        disturbance: State | None,
+        n: int,
+        parameters: Sequence[str],
+        readings: Readings | None,
+        steps: dict[str, Any] | None,
     ) -> None:
-        """Refuse λ, w, readings or names of parameters that differ from those of the file.
+        """Refuse λ, w, readings, steps or names of parameters that differ from those of the file.
 
         Args:
             disturbance: w of n states, followed by zeros for parameters.
@@ -52,6 +59,8 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
         if self.readings != (readings and replace(readings, errors=readings.errors[:n])):
             raise UsageError(f"Expected the readings of {str(self.path)!r}, got others; {NEW_FILE}.")
+        if self.steps != steps:
+            raise UsageError(f"Expected the steps of {str(self.path)!r}, or none, got others; {NEW_FILE}.")
 
     def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
         """Refuse D or P that differ from those of the file.
@@ -107,7 +116,10 @@ def kept_region(path: Path) -> KeptRegion:
             lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
             contracting = Box(lowest, highest), Y
         D = Box(lower[1 : 1 + n], upper[1 : 1 + n])
-        return KeptRegion(path, decay, D, ranges, contracting, w, readings, hole, wanted, rho, seconds)
+        steps = of.get("steps")
+        if steps is not None:
+            steps = {"dt": float(steps["dt"]), "method": str(steps["method"])}
+        return KeptRegion(path, decay, D, ranges, contracting, w, readings, steps, hole, wanted, rho, seconds)
 
 
 def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:

@@ -131,6 +131,11 @@ class Funnel(ReadAtTimes):
         from lyapnet.prover.float_errors import FloatLaw
 
         require_goal(controller.problem, self.kind)
+        if self.time == "steps" and (self.disturbance or run.two_sided):
+            got = "--disturbance" if self.disturbance else "--two-sided"
+            raise UsageError(
+                f"Expected --time steps alone, got {got}, which is about continuous time; leave one of the two out."
+            )
         if not isinstance(self.file, FloatLaw | None):
             raise UsageError(
                 f"Expected file as the law that it computes, got {self.file!r}; take "
@@ -141,7 +146,7 @@ class Funnel(ReadAtTimes):
             controller.closed_loop, controller.problem, self.alpha, slack_of(self.delta, controller),
             box_of(self.states), run.budget, run.generator, run.report, run.keep, degree=DEGREE if run.two_sided else 2,
             disturbance=disturbance_of(self.disturbance, controller),
-            readings=readings_of(self, controller, made_for), law=self.file,
+            readings=readings_of(self, controller, made_for), law=self.file, steps=self.time == "steps",
         )  # fmt: skip
         return SoundCertificate(controller, found, run.options(self))
 
@@ -251,7 +256,7 @@ class Region(ReadAtTimes):
 
     With a disturbance, it is a set that no closed loop leaves, and a smaller set that each closed loop enters and never
     leaves. With parameters, it holds for every plant whose constant parameters lie in the given intervals.
-    Without `time` u is read at every t.
+    Without `time` it is about steps if V was trained for these, and otherwise u is read at every t.
     lyapnet.claims.region.ProvedRegion states the conditions.
     """
 
@@ -279,13 +284,29 @@ class Region(ReadAtTimes):
         from lyapnet.claims.region import prove_region
         from lyapnet.claims.region_certificate import RegionCertificate
 
+        steps = self.about_steps(controller)
         found = prove_region(
             controller.closed_loop, controller.problem, self.decay, box_of(self.states), run.budget, run.generator,
             run.report, run.keep, disturbance=disturbance_of(self.disturbance, controller),
             plants=plants_of(controller, self.parameters) if self.parameters else None,
-            readings=readings_of(self, controller, "continuous", forever=True),
+            readings=readings_of(self, controller, "continuous", forever=True), steps=steps,
         )  # fmt: skip
         return RegionCertificate(controller, found, run.options(self))
+
+    def about_steps(self, controller: "Controller") -> bool:
+        """Whether the claim is about the steps of the model.
+
+        Raises:
+            UsageError: it is, with a disturbance.
+        """
+        held = self.interval or self.jitter or self.delay or self.measured or self.quantised or self.disturbance
+        made_for = getattr(controller.program, "steps", False) and not held
+        steps = self.time == "steps" or (self.time is None and made_for)
+        if steps and self.disturbance:
+            raise UsageError(
+                "Expected --time steps alone, got --disturbance, which is about continuous time; leave one of them out."
+            )
+        return steps
 
 
 @dataclass(frozen=True, kw_only=True)

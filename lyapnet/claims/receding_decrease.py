@@ -75,10 +75,14 @@ class RecedingDecrease(DecreaseCondition):
         rim = minimum(
             self.V, *faces(*over_time(append_constants(around.box, states), 0.0), [1 + i for i in seen]), budget
         )
+        self._choose_hole(around, level, rim, proposed)
+        self.constraints = OutsideTheHole(self.V, around.box, self.hole)
+
+    def _choose_hole(self, around: Contraction, level: float, rim: float, proposed: float | None) -> None:
+        """Choose c below `rim`, a lower bound of V around the hole."""
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
         if proposed is not None and not self.hole < rim:
-            raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
-        self.constraints = OutsideTheHole(self.V, around.box, self.hole)
+            raise UsageError(f"Expected V > c = {self.hole!r} around the hole, got V ≥ {rim:g}; {REMEDY}.")
 
     def open_everywhere(self, level: float) -> None:
         """Exclude {x ∈ D: V < c} from the condition, where disturbances or a held control may increase V."""

@@ -26,6 +26,7 @@ from lyapnet.claims.kept_regions import KeptRegion, kept_region
 from lyapnet.claims.plants import Plants
 from lyapnet.claims.preconditions import at_centre, first_states
 from lyapnet.claims.receding_decrease import RecedingDecrease
+from lyapnet.claims.stepped_decrease import SteppedDecrease
 from lyapnet.claims.ultimate_bound import extent_of, ultimate_level
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
@@ -35,11 +36,13 @@ from lyapnet.prover.proof import Progress, Proof
 from lyapnet.prover.readings import Readings
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
 from lyapnet.task.constraints import Constraints, names_of
+from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
 PER_HORIZON = 0.01  # default of λT
+ROUGHLY = 0.1  # relative tolerance of a level that no V in D is above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +75,16 @@ class ProvedRegion:
     with V(x̂) ≤ ρ, as long as it may be in use (see Readings). Since a held control need not let V fall near the goal,
     the hole and what follows are as with a disturbance, which may be 0.
 
+    With steps, all of this is about x_{k+1} = F(x_k), one step of the horizon's method with u(0, x_k) held, and nothing
+    about the time between the steps. At each x ∈ D with V(x) ≤ ρ
+
+        V(F(x)) ≤ (1 − λΔt) max(V(x), c)     and     F(x) ∈ D,
+
+    V > ρ wherever some constraint has h_j ≥ 0, V > c on D without B, and F contracts on B. {V ≤ ρ} may touch the
+    boundary of D. By induction V(x_k) ≤ max((1 − λΔt)^k V(x_0), c): no sequence of steps that starts in {x ∈ D: V ≤ ρ}
+    leaves it, and {x ∈ D: V ≤ c}, a closed set in B, is entered and not left. There all sequences converge to one fixed
+    point of F by Banach's theorem, at the rate 1 − κΔt.
+
     With plants, all of this holds for ẋ = F(x; p) with every constant p in a box P, where u and V depend on x alone.
     The region is the same for all p; each p has its own equilibrium, in the hole.
 
@@ -87,7 +100,7 @@ class ProvedRegion:
     decay: float  # λ in 1/s
     states: Box  # D
     rho: float  # the largest proved level; −∞ if none is proved
-    rim: float  # a lower bound of V on the boundary of D and where a constraint is violated; ρ < rim
+    rim: float  # a lower bound of V on the boundary of D and where a constraint is violated; ρ < rim; ∞ if ρ may be any
     wanted: float  # an upper bound of max V on X₀, at most 0.1 % above it
     least: float  # the largest V among samples of X₀
     hole: float  # c; 0 without a hole
@@ -107,6 +120,7 @@ class ProvedRegion:
     precision: str | None = None  # the number type in which u is computed; None for real numbers
     distance_left: float = math.nan  # a bound of the distance from the goal as t → ∞, if u is rounded
     readings: Readings | None = None  # when u is read; None: at every t
+    steps: Horizon | None = None  # Δt and method of the steps; None: continuous time
 
     @property
     def practical(self) -> bool:
@@ -166,10 +180,12 @@ class ProvedRegion:
             )  # fmt: skip
         plants = "" if self.plants is None else " of all plants"
         if self.contraction is None and not self.slowest < 0:
+            grows = f"an eigenvalue with real part {self.slowest:.3g} 1/s"
+            if self.steps is not None:
+                grows = f"a step with an eigenvalue of size {math.sqrt(1 + 2 * self.steps.dt * self.slowest):.3g}"
             return (
-                f"u(0, x) does not stabilise the goal{plants}: its linearisation has an eigenvalue with real part "
-                f"{self.slowest:.3g} 1/s; weigh every state in the cost, train on a longer horizon, or from states all "
-                f"around the goal{self._or_narrow}"
+                f"u(0, x) does not stabilise the goal{plants}: its linearisation has {grows}; weigh every state in the "
+                f"cost, train on a longer horizon, or from states all around the goal{self._or_narrow}"
             )
         if self.contraction is None:
             return (
@@ -224,14 +240,15 @@ class ProvedRegion:
         return math.prod(w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out)
 
 
-def _read_kept(
-    file: Path | None, decay: float, w: State | None, n: int, names: Sequence[str], readings: Readings | None
-) -> KeptRegion | None:
-    """The numbers in the file of the same claim; None if the file does not exist yet."""
+def _read_kept(file: Path | None, condition: RecedingDecrease, n: int) -> KeptRegion | None:
+    """The numbers in the file of the same claim about n states; None if the file does not exist yet."""
     if file is None or not file.exists():
         return None
     kept = kept_region(file)
-    kept.require(decay, w, n, names, readings)
+    kept.require(
+        condition.decay, condition.disturbance, n, condition.parameter_names, condition.readings,
+        condition.facts.get("steps"),
+    )  # fmt: skip
     return kept
 
 
@@ -248,6 +265,7 @@ def prove_region(
     disturbance: State | None = None,
     plants: Plants | None = None,
     readings: Readings | None = None,
+    steps: bool = False,
 ) -> ProvedRegion:
     """Prove the largest sublevel set of V(0, ·) that a budget allows as a region of attraction of the receding law.
 
@@ -260,6 +278,7 @@ def prove_region(
         disturbance: w, (n,): the claim is about every ẋ = F + w(t) with |w_i(t)| ≤ w_i; w = 0 is no disturbance.
         plants: the claim is about each of these plants under the law and V of the nominal plant.
         readings: when u is read; None: at every t.
+        steps: whether the claim is about the steps of the horizon's method, without disturbance and readings.
 
     Raises:
         UsageError: λ, w or D are unsuitable, the system is a family, an operator has no bound, or the file has another
@@ -276,15 +295,21 @@ def prove_region(
         loop, problem = plants.all_of(loop, problem)
         states, w = states and plants.around(states), None if w is None else plants.disturbance_of_all(w)
         readings = readings and plants.readings_of_all(readings)
-    practical = w is not None or readings is not None
-    condition = RecedingDecrease(loop, decay, w, names, readings)
-    goal, kept = problem.goal.double(), _read_kept(keep, decay, w, n, names, readings)
+    practical, stepped = w is not None or readings is not None, problem if steps else None
+    condition = (
+        SteppedDecrease(loop, decay, problem, names) if steps else RecedingDecrease(loop, decay, w, names, readings)
+    )
+    goal, kept = problem.goal.double(), _read_kept(keep, condition, n)
     setting = find_setting(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:
         kept.require_set(D, names)
-    rim = _level_of_boundary(condition.V, problem.constraints, domain, sides, budget_for_level(budget))
+    if isinstance(condition, SteppedDecrease):
+        condition.keep_within(D, seen)
+    rim = _level_of_boundary(
+        condition.V, problem.constraints, domain, None if steps else sides, budget_for_level(budget)
+    )
     contraction, slowest, level = _open_hole(condition, goal, setting, seen, rim, budget, kept)
     proof, rho, set_up = None, -math.inf, budget.elapsed
     if condition.hole > 0:
@@ -292,7 +317,9 @@ def prove_region(
         proof = prove_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if not practical or rho == -math.inf else _ultimate_set(condition, D, n, budget)
-    precision, distance = _rounding(loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen)
+    precision, distance = _rounding(
+        loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen, stepped
+    )  # fmt: skip
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return ProvedRegion(
         decay=decay, states=first_states(D, n), rho=rho, rim=rim, wanted=wanted, least=largest_sample(condition.V, X0),
@@ -301,18 +328,24 @@ def prove_region(
         seconds=time.monotonic() - started, left_out=left_out, constraints=names_of(problem.constraints),
         disturbance=None if w is None else w[:n], extent=extent, ultimate_share=ultimate, plants=plants, set_up=set_up,
         precision=precision, distance_left=distance,
-        readings=readings and replace(readings, errors=readings.errors[:n]),
+        readings=readings and replace(readings, errors=readings.errors[:n]), steps=problem.horizon if steps else None,
     )  # fmt: skip
 
 
 def _rounding(
-    loop: ClosedLoop, nominal: ClosedLoop, around: Contraction | None, goal: State, states: Box, seen: Sequence[int]
+    loop: ClosedLoop,
+    nominal: ClosedLoop,
+    around: Contraction | None,
+    goal: State,
+    states: Box,
+    seen: Sequence[int],
+    stepped: Problem | None,
 ) -> tuple[str | None, float]:
     """`precision` and `distance_left` of ProvedRegion; `nominal` is the closed loop of the nominal plant."""
     precision = nominal.policy.precision if isinstance(nominal.policy, ValuePolicy) else None
     if precision is None or around is None:
         return precision, math.nan
-    return precision, distance_left(loop, around, goal, states, seen)
+    return precision, distance_left(loop, around, goal, states, seen, stepped)
 
 
 def _ultimate_set(condition: RecedingDecrease, states: Box, n: int, budget: Budget) -> tuple[Box, float]:
@@ -354,8 +387,17 @@ def _open_hole(
         condition.open_everywhere(hole)
         return None, math.nan, level
     seconds, proposed = (levels.seconds, None) if kept is None else (LEVELS, kept.contracting)
-    contraction, slowest = contraction_around(condition.closed_loop, goal, setting.states, seen, seconds, proposed)
-    level = just_below(rim) if kept is None else kept.level(contraction is not None, rim)
+    stepped = condition.problem if isinstance(condition, SteppedDecrease) else None
+    contraction, slowest = contraction_around(
+        condition.closed_loop, goal, setting.states, seen, seconds, proposed, stepped
+    )  # fmt: skip
+    if kept is not None:
+        level = kept.level(contraction is not None, rim)
+    elif rim < math.inf:
+        level = just_below(rim)
+    else:  # a number that no V in D is above
+        lower, upper = (side[None] for side in setting.domain)
+        level = -minimum(lambda t, x: -condition.V(t, x), lower, upper, budget_for_level(budget), tolerance=ROUGHLY)
     if contraction is not None:
         condition.open_hole(contraction, setting.states, seen, level, budget_for_level(budget), kept and kept.hole)
     return contraction, slowest, level
@@ -384,11 +426,11 @@ def _level_of_boundary(
     V: Value,
     constraints: Constraints | None,
     domain: tuple[Corner, Corner],
-    sides: tuple[Corners, Corners],
+    sides: tuple[Corners, Corners] | None,
     budget: Budget,
 ) -> float:
-    """A lower bound of V on the boundary of D and on {x ∈ D: some h_j(x) ≥ 0}."""
-    rim = minimum(V, *sides, budget)
+    """A lower bound of V on the boundary of D, if its sides are given, and on {x ∈ D: some h_j(x) ≥ 0}."""
+    rim = math.inf if sides is None else minimum(V, *sides, budget)
     if constraints is None:
         return rim
     h, (lower, upper) = own_constraints(constraints, domain), (side[None] for side in domain)

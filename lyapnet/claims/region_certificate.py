@@ -24,9 +24,11 @@ from lyapnet.claims.held_laws import READINGS, control_of, readings_facts, readi
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
 from lyapnet.claims.region import ProvedRegion
+from lyapnet.claims.stepped_decrease import IntoTheHole, SteppedDecrease
 from lyapnet.claims.tables import floored
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
 NEARLY = 0.999  # of the least V on the boundary of D: a larger D is needed for a region with such a ρ to grow
@@ -50,6 +52,7 @@ class RegionCertificate(Certificate):
         "rho_wanted": "ρ for all of X₀",
         "rho": "largest ρ proved",
         "rim": "V(0, ·) on the boundary of D and of constraints, at least",
+        "steps": "about steps of",
         "decay": "λ, 1/s",
         "parameters": "parameters of the plant, constant, anywhere in",
         "nominal_parameters": "those that V and u were made for",
@@ -78,7 +81,9 @@ class RegionCertificate(Certificate):
     @property
     def complete(self) -> bool:
         """Whether no larger region is needed or possible in D: it contains X₀, or almost reaches the boundary of D."""
-        return self.verdict == "certified" or self.claim.rho >= NEARLY * self.claim.rim
+        claim = self.claim
+        highest = claim.proof.wanted if claim.steps is not None and claim.proof is not None else claim.rim
+        return self.verdict == "certified" or claim.rho >= NEARLY * highest
 
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, {0} × D, and the level up to which it was to be proved."""
@@ -87,11 +92,24 @@ class RegionCertificate(Certificate):
         if claim.plants is not None:
             states, w = claim.plants.around(states), None if w is None else claim.plants.disturbance_of_all(w)
             readings = readings and claim.plants.readings_of_all(readings)
+        if claim.steps is not None:
+            return *self._stepped(states), math.inf if claim.proof is None else claim.proof.wanted
         condition = RecedingDecrease(loop, claim.decay, w, readings=readings)
         if claim.hole > 0:
             around = None if claim.contraction is None else claim.contraction.box
             condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
         return condition, over_time(states, 0.0), claim.rim
+
+    def _stepped(self, states: Box) -> tuple[SteppedDecrease, tuple[Corner, Corner]]:
+        """The condition of steps, and {0} × D."""
+        problem, claim = copied(self.controller.problem), self.claim
+        if claim.plants is not None:
+            problem = claim.plants.problem(problem)
+        condition = SteppedDecrease(self._loop, claim.decay, problem)
+        condition.keep_within(states, [i for i in range(claim.states.dimension) if i not in claim.left_out])
+        if claim.hole > 0:
+            condition.hole, condition.constraints = claim.hole, IntoTheHole(condition)
+        return condition, over_time(states, 0.0)
 
     @property
     def _loop(self) -> ClosedLoop:
@@ -125,7 +143,9 @@ class RegionCertificate(Certificate):
             "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
         }  # fmt: skip
         return {
-            "decay": claim.decay, "rho": claim.rho if proved else None, "rho_wanted": claim.wanted, "rim": claim.rim,
+            "decay": claim.decay, "rho": claim.rho if proved else None, "rho_wanted": claim.wanted,
+            "rim": claim.rim if claim.rim < math.inf else None,
+            **({} if claim.steps is None else {"steps": f"{claim.steps.dt!r} s, {claim.steps.method}"}),
             "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
             "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
             "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
@@ -161,9 +181,10 @@ class RegionCertificate(Certificate):
             kept: the words on constraints.
         """
         claim, B = self.claim, self.claim.contraction
-        plants, equilibrium = "for this model", "one equilibrium exponentially,"
+        plants, equilibrium, of_all = "for this model", "one equilibrium exponentially,", ""
         if claim.plants is not None:
             ends = ", ".join(f"{name} ∈ [{low!r}, {high!r}]" for name, (low, high) in claim.plants.ranges.items())
+            of_all = f" for each of its plants with constant {ends}"
             plants = f"for each plant of this model with constant {ends}"
             equilibrium = "one equilibrium of their plant exponentially,"
         if B is not None:
@@ -172,6 +193,13 @@ class RegionCertificate(Certificate):
                 end = (
                     f"all converge exponentially to within {claim.distance_left:.3g} of the goal (in the norm of x) as "
                     f"t → ∞, for every rounding of the operations of u in {claim.precision}"
+                )
+            if claim.steps is not None:
+                return (
+                    "is a region of attraction of the receding law u(0, x) in discrete time, proved about the steps of "
+                    f"this model ({claim.steps.method}, Δt = {claim.steps.dt!r} s, u held over each){of_all}, and not "
+                    "about the plant between them: no sequence of steps that starts in it leaves it"
+                    f"{kept}, and {end}."
                 )
             return (
                 f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants} with u "
@@ -236,6 +264,21 @@ class RegionCertificate(Certificate):
                 inside,
             ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
+        if claim.steps is not None:
+            dt, d = repr(claim.steps.dt), repr(claim.decay)
+            inside = [f"V > {rho} wherever h_j(x) ≥ 0"] if claim.constraints else []
+            ends = (
+                ["B", "Y"] if B is None
+                else [f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]", f"Y = {B.coordinates.tolist()}"]
+            )  # fmt: skip
+            return [
+                f"V(F(x)) ≤ (1 − {dt} · {d}) max(V(x), {hole}) and F(x) ∈ D  with V = V(0, x), x⁺ = F(x) one step with "
+                f"u = u(0, x), at each x ∈ D with V ≤ {rho}{plants}{rounded}",
+                *inside,
+                f"V > {hole} > 0 on D without {ends[0]}",
+                f"½(P J + JᵀP) + ½ · {dt} JᵀPJ ≤ −{rate} P  with P = YᵀY, J the Jacobian of (F(x) − x)/{dt}, at each "
+                f"x ∈ B, where F is continuous{plants}{', without rounding' * bool(rounded)}; {ends[1]}",
+            ]
         box = "B" if B is None else f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]"
         Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
@@ -288,6 +331,18 @@ class RegionCertificate(Certificate):
             if claim.plants is not None:
                 loop = self._loop
                 x0 = torch.cat([x0, claim.plants.box.sample(len(x0), generator).to(x0)], -1)
+            if claim.steps is not None:
+                return self._sequences(x0, horizon.steps)[..., :n]
             times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
             paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
         return torch.as_tensor(paths)[..., :n]
+
+    def _sequences(self, x: Tensor, steps: int) -> Tensor:
+        """Sequences of steps from some states, (1 + steps, k, n)."""
+        condition, _ = self._stepped(
+            self.claim.states if self.claim.plants is None else self.claim.plants.around(self.claim.states)
+        )
+        t, path = x.new_zeros(()), [x.double()]
+        for _ in range(steps):
+            path.append(condition.after(path[-1], condition.closed_loop.policy(t, path[-1])))
+        return torch.stack(path)

@@ -17,10 +17,11 @@ from lyapnet.claims.certificates import (
     named_disturbance,
 )
 from lyapnet.claims.costs import CostCertificate, Inside
-from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.funnel import ProvedFunnel, before_last_step
 from lyapnet.claims.held_laws import READINGS, computed_text, control_of, readings_facts, readings_text
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.preconditions import over_time
+from lyapnet.claims.stepped_decrease import SteppedPayment
 from lyapnet.claims.tables import floored
 from lyapnet.prover.condition import DecreaseCondition
 
@@ -37,6 +38,7 @@ class SoundCertificate(CostCertificate):
         "delta": "δ, cost per second",
         "disturbance": "disturbances, at most",
         **READINGS,
+        "steps": "about steps of",
         "set": "D",
         "states_left_out": "states that nothing depends on",
         "rho_wanted": "ρ for all of X₀",
@@ -64,6 +66,10 @@ class SoundCertificate(CostCertificate):
         """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop = copied(self.controller.closed_loop)
+        if claim.steps is not None:
+            condition = SteppedPayment(loop, claim.alpha, claim.delta, copied(self.controller.problem))
+            condition.keep_within(claim.states, [i for i in range(loop.system.n) if i not in claim.left_out])
+            return condition, before_last_step(claim.steps, claim.states), claim.wanted
         condition = DecreaseCondition(
             loop, claim.alpha, claim.delta, disturbance=claim.disturbance, readings=claim.readings
         )
@@ -92,6 +98,7 @@ class SoundCertificate(CostCertificate):
             "boxes": claim.boxes, "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
             "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
             "fingerprint": claim.fingerprint, **constraints, **readings_facts(claim.readings, self.controller.system),
+            **({} if claim.steps is None else {"steps": f"{claim.steps.dt!r} s, {claim.steps.method}"}),
         }  # fmt: skip
 
     @property
@@ -103,10 +110,15 @@ class SoundCertificate(CostCertificate):
         claim = self.claim
         if not claim.volume_share:
             return NOT_PROVED
+        proved = f"in continuous time for this model {readings_text(claim.readings, self.controller.system)}"
+        if claim.steps is not None:
+            proved = (
+                f"in discrete time about the steps of this model ({claim.steps.method}, Δt = {claim.steps.dt!r} s, u "
+                "held over each), and not about the plant between them"
+            )
         return (
-            f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
-            f"model {readings_text(claim.readings, self.controller.system)}: no closed loop that starts in it leaves "
-            f"the funnel, or D,{self._or_violates} up to "
+            f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved {proved}: no closed loop that "
+            f"starts in it leaves the funnel, or D,{self._or_violates} up to "
             f"T = {claim.duration:g} s, {self._under_disturbances}and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. "
             f"{computed_text(claim.readings, self.controller.system, claim.left_out)}It is about the traced "
@@ -137,6 +149,15 @@ class SoundCertificate(CostCertificate):
                 f"with u = {control_of(claim.readings, 'policy(t̂, x̂{})')} at (t̂ + a, x(t̂ + a)), 0 ≤ a ≤ {longest}, "
                 f"t̂ + a ≤ {T}, after each reading (t̂, x̂) ∈ [0, {T}] × D with V(t̂, x̂) ≤ {rho} + {delta} t̂"
             )
+        if claim.steps is not None:
+            dt = repr(claim.steps.dt)
+            return [
+                f"(V(t + {dt}, F(x, u)) − V(t, x))/{dt} + {alpha} ℓ̄(x, u) ≤ {delta} and F(x, u) ∈ D  with "
+                f"u = policy(t, x), F and ℓ̄ of one step, at each (t, x) ∈ [0, {T} − {dt}] × D with V(t, x) ≤ "
+                f"{rho} + {delta} t",
+                f"V(t_n, x_n) ≤ {rho} + {delta} t_n  and  x_n ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}",
+                f"J(x₀) = Σ {dt} ℓ̄ + φ ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
+            ]
         return [
             f"V_t + V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if self.disturbance else ''} + {alpha} ℓ(x, u) ≤ {delta}  "
             f"{where}",

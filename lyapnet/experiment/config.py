@@ -63,6 +63,7 @@ class ProgramConfig:
     bound: float | None = setting(None, "Weight of V(0, x₀), the upper bound of the cost (lyapunov only).", at_least=0)
     share: float | None = setting(None, "Smallest decrease of V, as a share of ℓ (region only).", above=0)
     growth: float | None = setting(None, "Weight of the share of D outside the region (region only).", at_least=0)
+    steps: bool | None = setting(None, "Whether V is to fall in steps of Δt, not in continuous time (region only).")
     parameters: dict[str, Any] = setting({}, "Further arguments of a program of your own.")
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.base.linear_algebra import apply
-from lyapnet.base.types import PerState, State, Time
+from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.loop.programs.base import Program
 from lyapnet.loop.rollout import ClosedLoop, Rollout
 from lyapnet.task.problem import Problem
@@ -119,7 +119,7 @@ class PointwiseCondition:
     def _violation(self, t: Time, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
         u = self.closed_loop.policy(t, x)
         running = self.closed_loop.cost.running(x, u)
-        rate = time_derivative(self.V, self.closed_loop.system, t, x, u)
+        rate = self.rate(t, x, u)
         if self.closed_loop.noise is not None:
             rate = rate + noise_derivative(self.V, self.closed_loop.noise(x), t, x)
             if self.problem.risk:
@@ -127,6 +127,10 @@ class PointwiseCondition:
                 rate = rate + self.problem.risk / 2 * slope.square().sum(-1)
         excess = self.program.excess(rate, running)
         return self._relative(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
+
+    def rate(self, t: Time, x: State, u: Control) -> PerState:
+        """V̇ without noise."""
+        return time_derivative(self.V, self.closed_loop.system, t, x, u)
 
     def _end_violation(self, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
         value, cost = self.V(x.new_full(x.shape[:-1], self.duration), x), self.closed_loop.cost.terminal(x)

@@ -6,10 +6,10 @@ from types import MappingProxyType
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lyapnet.base.types import PerState, State, ValuePath
+from lyapnet.base.types import Control, PerState, State, Time, ValuePath
 from lyapnet.loop.programs.base import Program
 from lyapnet.loop.programs.pointwise import PointwiseCondition
 from lyapnet.loop.programs.terms import hinge, terminal_hinge
@@ -19,7 +19,7 @@ from lyapnet.value.networks import kept_states
 CEILING = 1.15  # points with V above this multiple of the least V on the boundary of D do not count
 STEP_SHARPNESS = 8.0  # slope of the smooth step at V = ρ, in log V
 MINIMUM_SHARPNESS = 30.0  # exponent of the smooth minimum over the boundary
-BOUNDARY_POINTS = 1024  # random points on the boundary of D for ρ
+BOUNDARY_POINTS = 1024  # random points for ρ: on the boundary of D, or from which a step leaves D
 VOLUME_SAMPLES = 20_000  # random points of D that measure the region
 
 
@@ -31,9 +31,13 @@ class RegionProgram(Program):
     loops and their cost J_N are further terms. V is not the cost-to-go but a Lyapunov function of its law; with share <
     1 it may be steeper than the cost-to-go where that enlarges the region.
 
+    With `steps` it is about the steps x⁺ = F(x) of the horizon's method, with u held, for a claim about these: V̇ is
+    (V(x⁺) − V(x))/Δt, and ρ the least V from which a step leaves D. The region may then touch the boundary of D.
+
     Args:
         share: smallest decrease of V relative to the running cost; positive as a reserve for a proof.
         growth: weight of the share of D outside the region, relative to the condition.
+        steps: whether V is to fall in steps of Δt.
     """
 
     degree: ClassVar[int] = 1
@@ -45,6 +49,7 @@ class RegionProgram(Program):
 
     share: float = 0.4
     growth: float = 0.06
+    steps: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,7 +83,9 @@ class RegionCondition(PointwiseCondition):
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step; `largest_value` is not used."""
-        level = -torch.logsumexp(-MINIMUM_SHARPNESS * self._log_value(self._boundary(generator)), 0) / MINIMUM_SHARPNESS
+        x, leaving = self._leaving(generator)
+        heights = torch.where(leaving, -MINIMUM_SHARPNESS * self._log_value(x), -torch.inf)
+        level = -torch.logsumexp(heights, 0) / MINIMUM_SHARPNESS
         failing = self.condition(generator, self.floor * mean_cost.detach(), CEILING * level.detach().exp())
         inside = self.region.sample(2 * self.points, generator).to(mean_cost)
         return failing + self.program.growth * torch.sigmoid(STEP_SHARPNESS * (self._log_value(inside) - level)).mean()
@@ -86,13 +93,42 @@ class RegionCondition(PointwiseCondition):
     @torch.no_grad()
     def sampled_share(self, generator: torch.Generator) -> Float[Tensor, ""]:
         """The share of D in the largest {V ≤ ρ} on which V decreases, estimated from samples."""
-        V, loop = self.V, self.closed_loop
         x, now = self.region.sample(VOLUME_SAMPLES, generator).to(self.goal), self.goal.new_zeros(())
-        value, slope = V.value_and_state_gradient(now, x)
-        rising = (slope * loop.system.dynamics(x, loop.policy(now, x))).sum(-1) >= 0
-        boundary = self._log_value(self._boundary(generator)).exp()
-        level = torch.minimum(value.where(rising, torch.inf).min(), boundary.min())
+        value, failing = self.V(now, x), self.rate(now, x, self.closed_loop.policy(now, x)) >= 0
+        if self.program.steps:
+            failing |= self._outside(self._step(x))
+        edge, leaving = self._leaving(generator)
+        boundary = self.V(now, edge).where(leaving, torch.inf)
+        level = torch.minimum(value.where(failing, torch.inf).min(), boundary.min())
         return (value < level).to(x).mean()
+
+    def rate(self, t: Time, x: State, u: Control) -> PerState:
+        """V̇; with steps (V(F(x, u)) − V(x))/Δt."""
+        if not self.program.steps:
+            return super().rate(t, x, u)
+        return (self.V(t, self.problem.step(x, u)[0]) - self.V(t, x)) / self.problem.horizon.dt
+
+    @torch.no_grad()
+    def _leaving(self, generator: torch.Generator) -> tuple[State, Bool[Tensor, " points"]]:
+        """Points whose least V is ρ, and which of them count: points on the boundary of D; with steps, points up to a
+        step before it, where they are left with the next one.
+        """
+        x = self._boundary(generator)
+        if not self.program.steps:
+            return x, torch.ones(len(x), dtype=torch.bool, device=x.device)
+        back = torch.rand(len(x), 1, generator=generator, dtype=torch.float64).to(x)
+        before = x + back * (x - self._step(x))
+        before = torch.minimum(torch.maximum(before, self.region.lower.to(x)), self.region.upper.to(x))
+        return before, self._outside(self._step(before))
+
+    def _step(self, x: State) -> State:
+        """F(x), the state one step later."""
+        return self.problem.step(x, self.closed_loop.policy(x.new_zeros(()), x))[0]
+
+    def _outside(self, x: State) -> Bool[Tensor, " points"]:
+        """Whether states lie outside D, along the states on which V depends."""
+        outside = (x < self.region.lower.to(x)) | (x > self.region.upper.to(x))
+        return outside[..., self.axes].any(-1)
 
     def _log_value(self, x: State) -> PerState:
         return self.V(x.new_zeros(()), x).clamp_min(torch.finfo(x.dtype).tiny).log()

@@ -79,6 +79,10 @@ REGIONS = {  # arXiv 2506.01356, table 1 and appendix C.2: system, its parameter
     "pendulum_strong": (Pendulum, PENDULUM, 6, [20, 100]),
     "path_tracking_wide": (PathTracking, CIRCLE, 0.84, [10, 10]),
     "path_tracking_narrow": (PathTracking, CIRCLE, 0.5, [10, 10]),
+    # arXiv 2411.18235, table 2, in Euler steps of 0.05 s:
+    "steps_pendulum_strong": (Pendulum, PENDULUM, 6, [12, 12]),
+    "steps_path_tracking_wide": (PathTracking, CIRCLE, 0.84, [3, 3]),
+    "steps_path_tracking_narrow": (PathTracking, CIRCLE, 0.5, [3, 3]),
 }
 REFERENCE = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # the paper's four tasks
 
@@ -103,11 +107,15 @@ def test_the_regions_are_the_published_tasks(name):
     config = load_config(CONF / "regions" / f"{name}.yaml")
     problem, _, program, _ = objects(config)
     assert type(problem.system) is cls
-    x, u = torch.randn(9, 2).double(), torch.randn(9, 1).double()
+    x, u = torch.randn(9, len(reach)).double(), torch.randn(9, 1).double()
     assert_close(problem.system.dynamics(x, u), cls(**parameters).double().dynamics(x, u))
     assert problem.controls.limits == (-limit, limit)
     assert config.pointwise.region == reach
     assert (config.experiment, type(program)) == (f"{name}_region", RegionProgram)
+    if name.startswith("steps_"):
+        assert (program.steps, problem.horizon.dt, problem.horizon.method) == (True, 0.05, "euler")
+    else:
+        assert not program.steps
 
 
 def test_every_shipped_config_is_a_task_of_the_sheet():

@@ -12,7 +12,7 @@ from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.programs import RegionCondition, RegionProgram
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import DoubleIntegrator
+from lyapnet.task.systems import DoubleIntegrator, Linear
 from lyapnet.training.build import build_module
 from lyapnet.training.start import choose_start
 from lyapnet.value.policy import HJBPolicy
@@ -64,6 +64,34 @@ def inscribed(P, reach):
 def test_the_sampled_region_is_the_inscribed_ellipse(of, reach):
     share = float(of(P, reach).sampled_share(stream(0)))
     assert share == pytest.approx(inscribed(P, reach) / (4 * reach[0] * reach[1]), abs=0.01)
+
+
+def turning(growth=0.06, size=0.9):
+    """The condition of V = ‖x‖² on [−1, 1]² for steps that turn by 45° and shrink by `size`."""
+    half = size * math.sqrt(0.5)
+    step = torch.tensor([[half, -half], [half, half]]).double()
+    system = Linear(((step - torch.eye(2)) / 0.1).tolist(), [[0.0], [0.0]])
+    problem = problem_of(system, dt=0.1).in_steps(stationary=True)
+    rollout = Rollout(problem, HJBPolicy(problem, Formula(lambda t, x: x.square().sum(-1) + 0 * t)))
+    program = RegionProgram(steps=True, growth=growth, share=1e-9)
+    return RegionCondition(rollout, program, Box([-1.0, -1.0], [1.0, 1.0]), 5.0, 64)
+
+
+def test_with_steps_the_region_ends_where_the_next_step_leaves_the_set():
+    """‖x‖ = 1/0.9 in the direction of a corner: beyond the circle in the square, whose share is π/4."""
+    beyond = math.sqrt(1 / 0.81 - 1)
+    area = 4 * beyond + 4 * (math.atan2(1, beyond) - math.pi / 4) / 0.81
+    assert float(turning().sampled_share(stream(0))) == pytest.approx(area / 4, abs=0.02)
+
+
+@torch.no_grad()
+def test_with_steps_V_has_to_fall_from_step_to_step():
+    """(0.81 − 1)‖x‖²/Δt; V̇ of the same system is another number."""
+    condition, x = turning(), torch.tensor([[0.3, -0.4]]).double()
+    rate = condition.rate(torch.zeros(()), x, torch.zeros(1, 1).double())
+    assert float(rate) == pytest.approx(-0.19 * 0.25 / 0.1)
+    assert float(turning(growth=0.0)(stream(1), COST, COST)) == 0
+    assert float(turning(growth=0.0, size=1.01)(stream(1), COST, COST)) > 0
 
 
 def test_where_V_rises_there_is_no_region(of):

@@ -1,0 +1,158 @@
+"""Conditions on V and the steps of the model, of claims in discrete time, to be proved on boxes."""
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError
+from lyapnet.base.types import Control, Corner, PerState, Points, State, Time
+from lyapnet.claims.contraction import Contraction
+from lyapnet.claims.preconditions import append_constants, over_time
+from lyapnet.claims.receding_decrease import RecedingDecrease
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget, minimum
+from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.task.constraints import Constraints
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
+
+WITHIN = 1e-12  # by which F(x) has to lie in D, relative to the half widths of D, for the rounding of these
+
+
+class Stepped(DecreaseCondition):
+    """A condition on the steps x⁺ = F(x, u) of a problem, which also requires F(x, u) ∈ D.
+
+    Its parts are (c, W, how far F(x, u) is outside of D).
+    """
+
+    problem: Problem
+    sides: Sequence[tuple[int, float, float]]  # (axis, middle, half width) of D where it has bounds
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        return {**super().facts, "steps": steps_of(self.problem.horizon)}
+
+    def keep_within(self, states: Box, axes: Sequence[int]) -> None:
+        """Require F(x, u) ∈ D along some axes: those with bounds, without constants."""
+        ends = zip(states.center.tolist(), (states.widths / 2).tolist(), strict=True)
+        self.sides = [(i, middle, half) for i, (middle, half) in enumerate(ends) if i in axes]
+
+    def after(self, x: State, u: Control) -> State:
+        """F(x, u)."""
+        return x + self.problem.horizon.dt * self.problem.smooth_rates(x, u)[0]
+
+    def outside(self, after: State) -> PerState:
+        """How far a state is outside of D, relative to D; at most 0 in D."""
+        beyond = [(after[..., i] - middle).abs() / half - (1 - WITHIN) for i, middle, half in self.sides]
+        return reduce(torch.maximum, beyond) if beyond else torch.full_like(after[..., 0], -1.0)
+
+    def values(self, points: Points) -> tuple[PerState, PerState]:
+        """(c, W) at points (t, x); c > 0 also where the next state lies outside of D; c is −∞ at excluded states."""
+        t, x = points[:, 0], points[:, 1:]
+        c, value, outside = self.parts(t, x)
+        return torch.where(self.excluded(x), -torch.inf, torch.maximum(c, outside)), value
+
+
+class SteppedPayment(Stepped):
+    """c = (V(t + Δt, F(x, u)) − V(t, x))/Δt + α max(ℓ̄, 0) − δ with u = policy(t, x) and ℓ̄ the mean of ℓ over the step.
+
+    Where c ≤ 0, W = V − δt falls by α times the cost of the step, or more. It is meant for 0 ≤ t ≤ T − Δt.
+
+    Args:
+        problem: F and ℓ̄ are of one step of its horizon's method, with u held.
+    """
+
+    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float, problem: Problem):
+        super().__init__(closed_loop, alpha, delta)
+        self.problem, self.sides = problem, []
+
+    def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
+        return self.parts_under(t, x, self.closed_loop.policy(t, x))
+
+    def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
+        dt = self.problem.horizon.dt
+        rate, cost = self.problem.rates(x, u)
+        after = x + dt * rate
+        fall = (self.V(t + dt, after) - self.V(t, x)) / dt
+        return fall + self.alpha * torch.clamp(cost, min=0) - self.delta, self.height(t, x), self.outside(after)
+
+
+class SteppedDecrease(Stepped, RecedingDecrease):
+    """(V(F(x)) − V(x))/Δt + λV(x) ≤ 0 and F(x) ∈ D, with V = V(0, ·) and u = u(0, x), but for steps into a hole.
+
+    So V falls by the factor 1 − λΔt or more in each step, until the next one leads to V < (1 − λΔt)c.
+
+    Args:
+        problem: F is one step of its horizon's method, with u(0, x) held.
+        parameters: as in RecedingDecrease.
+    """
+
+    def __init__(self, closed_loop: ClosedLoop, decay: float, problem: Problem, parameters: Sequence[str] = ()):
+        RecedingDecrease.__init__(self, closed_loop, decay, parameters=parameters)
+        dt = problem.horizon.dt
+        if not decay * dt < 1:
+            raise UsageError(f"Expected decay < 1/Δt = {1 / dt:g}, got {decay}; V cannot fall by more than itself.")
+        self.problem, self.sides = problem, []
+
+    def open_hole(
+        self,
+        around: Contraction,
+        states: Box,
+        seen: Sequence[int],
+        level: float,
+        budget: Budget,
+        proposed: float | None = None,
+    ) -> None:
+        """Choose c ≤ level below V on D without B, so that {x ∈ D: V < c} ⊂ B; steps may lead there without more.
+
+        A step may jump over the boundary of B, so that V > c there is not enough.
+        """
+        whole = append_constants(around.box, states)
+        self._choose_hole(around, level, minimum(self.V, *_outside(whole, states, seen), budget), proposed)
+        self.constraints = IntoTheHole(self)
+
+    def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
+        t, after = torch.zeros_like(t), self.after(x, u)
+        value = self.V(t, x)
+        return (self.V(t, after) - value) / self.problem.horizon.dt + self.decay * value, value, self.outside(after)
+
+
+class IntoTheHole(Constraints):
+    """h(x) > 0 where the next step leads into the hole: V(F(x)) < (1 − λΔt)c and F(x) ∈ D."""
+
+    names = ("a step into the hole",)
+
+    def __init__(self, condition: SteppedDecrease):
+        super().__init__()
+        self.of = [condition]  # no module of its own: the condition has this one
+        self.level = condition.hole - condition.hole * condition.decay * condition.problem.horizon.dt
+
+    def forward(self, x: State) -> Tensor:
+        (condition,) = self.of
+        t = torch.zeros_like(x[..., 0])
+        after = condition.after(x, condition.closed_loop.policy(t, x))
+        lower = (self.level - condition.V(t, after)) / self.level
+        return torch.minimum(lower, -condition.outside(after))[..., None]
+
+
+def steps_of(horizon: Horizon) -> dict[str, Any]:
+    """Δt and the method of the steps, as plain data."""
+    return {"dt": horizon.dt, "method": horizon.method}
+
+
+def _outside(inner: Box, states: Box, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Boxes of (0, x) that cover D without the interior of a box in it."""
+    lower: list[Corner] = []
+    upper: list[Corner] = []
+    low, high = over_time(states, 0.0)
+    for i in axes:
+        below, above = high.clone(), low.clone()
+        below[1 + i], above[1 + i] = inner.lower[i], inner.upper[i]
+        lower += [low.clone(), above]
+        upper += [below, high.clone()]
+        low[1 + i], high[1 + i] = inner.lower[i], inner.upper[i]
+    return torch.stack(lower), torch.stack(upper)

@@ -201,7 +201,7 @@ def test_an_interrupt_leaves_the_facts(tmp_path):
     lines = shown.splitlines()
     assert lines[0] == "long.yaml, before training"
     assert [line[:14].strip() for line in lines if not line.startswith(" ")][1:] == [
-        "horizon", "X₀", "system", "goal", "modes", "controllable", "step gain", "start",
+        "horizon", "X₀", "system", "goal", "modes", "controllable", "limits", "step gain", "start",
     ]  # fmt: skip
     assert max(map(len, lines)) <= 80
     *stages, last = notes.splitlines()

@@ -328,6 +328,7 @@ def test_a_row_taken_out_is_in_no_reader():
     assert not any(SOFT.name in rules for rules in READERS.values())
 
 
+@pytest.mark.gate
 @needs_c
 @needs_compiler
 def test_the_page_adds_operators_in_one_file(tmp_path):

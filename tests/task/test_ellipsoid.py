@@ -81,6 +81,7 @@ def test_the_best_control_is_that_of_another_solver():
         assert_close(paid(0.99 * u), least, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.gate
 def test_a_controller_says_controls_of_it_and_so_does_its_c(tmp_path):
     own = Controller(build_problem(config_from_plain(PLAIN)), Bowl(), policy=SampledPolicy)
     x = 2 * torch.randn(2000, 4)

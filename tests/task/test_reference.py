@@ -78,6 +78,7 @@ def test_without_end_it_repeats():
     assert_close(once.initial_states.upper[2], torch.tensor(PERIOD - 1.0))  # there a horizon of 1 s still fits
 
 
+@pytest.mark.gate
 def test_the_optimum_about_a_reference_is_the_regulators():
     """For a linear system V(t, x, τ) = (x − r(τ))ᵀP(t)(x − r(τ)) with the P of the task about 0, if r can be followed.
 

@@ -100,6 +100,7 @@ def test_the_task_in_shares_has_the_dynamics_and_the_cost_of_the_controls_that_a
     assert written_cost(problem.cost) is cost
 
 
+@pytest.mark.gate
 def test_the_best_share_is_the_best_control_between_the_limits():
     system, cost = SYSTEMS["reacher"](), QuadraticCost(torch.eye(4), [[2.0, 0.9], [0.9, 1.0]], torch.eye(4))
     problem = problem_of(system, cost, controls=Falling())

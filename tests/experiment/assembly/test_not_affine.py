@@ -92,6 +92,7 @@ def found_of(scale):
     return problem, V, fact.found
 
 
+@pytest.mark.gate
 def test_check_names_a_state_where_the_hamiltonian_is_not_convex():
     """There it bends downwards indeed; ℓ alone is convex, and says so."""
     problem, V, found = found_of(100.0)

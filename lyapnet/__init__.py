@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from lyapnet.task.problem import Problem
     from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
     from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, ControlSystem, EquationSystem
+    from lyapnet.task.systems.contact import friction_force, normal_force
     from lyapnet.task.varying_limits import LimitTable, VaryingLimits
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
@@ -101,6 +102,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "task.models.systems": ["casadi_system"],
     "task.models.sympy_equations": ["sympy_system"],
     "task.systems": ["SYSTEMS", "ControlAffineSystem", "ControlSystem", "EquationSystem"],
+    "task.systems.contact": ["friction_force", "normal_force"],
     "task.varying_limits": ["LimitTable", "VaryingLimits"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
@@ -181,8 +183,10 @@ __all__ = [
     "certify",
     "evaluate",
     "export",
+    "friction_force",
     "load",
     "norm",
+    "normal_force",
     "option",
     "sympy_system",
     "train",

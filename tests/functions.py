@@ -2,6 +2,8 @@
 
 import torch
 
+import lyapnet
+
 W = torch.tensor([[0.3, -1.2, 0.7], [0.1, 0.4, -0.9]])  # promoted to float64 by the bounds
 
 FIRST = torch.tensor([0])
@@ -27,6 +29,7 @@ FUNCTIONS = {
     "silu": lambda t, x: torch.nn.functional.silu(3 * x),
     "sin": lambda t, x: torch.sin(6 * x + t),
     "cos": lambda t, x: torch.cos(6 * x - 3 * t),
+    "contact": lambda t, x: lyapnet.normal_force(x, x * t, 9.0, 0.1, 0.5) + lyapnet.friction_force(x, 1 + t, 0.4, 0.3),
     "sums": lambda t, x: torch.stack([x.sum(), x.mean(), (x[:, None] * x).sum(0).sum()]) - x.sum(0, keepdim=True),
     "matrices": lambda t, x: (x[:, None] * x) @ weights(x)[:, :2] @ torch.stack([x, x * t]) + torch.mv(x[:, None] * x, x),  # noqa: E501
     "arrangements": lambda t, x: torch.cat([x.flip(0)[:0], x[1:], t[None]]).unsqueeze(-1).expand(-1, 3).mT.reshape(-1),

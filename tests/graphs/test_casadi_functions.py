@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+import lyapnet
 from lyapnet.base.errors import OracleError
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 
@@ -46,6 +47,7 @@ FUNCTIONS = {
     "activations": lambda x: torch.nn.functional.softplus(x) + torch.relu(x) + torch.nn.functional.silu(x)
     + torch.nn.functional.elu(x) + torch.nn.functional.gelu(x),
     "branches": lambda x: torch.where(x > 0, x, -2 * x) + torch.sign(x) + torch.clamp(x, -0.5, 0.5) + x.clamp(min=0),
+    "contact": lambda x: lyapnet.normal_force(x, x.flip(-1), 9.0, 0.1, 0.5) + lyapnet.friction_force(x, x**2, 0.4, 0.3),
     "logic": lambda x: torch.where((x > 0) & ~(x >= 1) | (x < -1), x, 0.0) + (x == 0),
     "extremes": lambda x: torch.maximum(x, x.flip(-1)) + torch.minimum(x, 0 * x) + x.amax(-1, True) - x.amin(-1),
     "rounding": lambda x: torch.floor(x) + torch.ceil(3 * x) + torch.fmod(x, 0.7) + torch.remainder(x, 0.7),

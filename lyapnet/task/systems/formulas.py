@@ -18,8 +18,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.files import LARGEST_TEXT
-
-Number = float | Tensor
+from lyapnet.task.systems.contact import Number, friction_force, normal_force
 
 MOST_OPERATIONS = 100_000
 
@@ -31,15 +30,22 @@ class Operation(NamedTuple):
         of_tensors: its function in torch.
         of_numbers: its function in NumPy, for operands that are known before any state is.
         operands: how many it takes.
+        tensors: how many of them, the first ones, it needs as tensors; None: all.
     """
 
     of_tensors: Callable[..., Any]
     of_numbers: Callable[..., Any]
     operands: int = 1
+    tensors: int | None = None
 
 
 def _copysign(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(b < 0, -a.abs(), a.abs())
+
+
+def _on_numbers(function: Callable[..., Tensor]) -> Callable[..., float]:
+    """A function of tensors, for numbers; the parameters of a contact are checked as numbers."""
+    return lambda first, second, *rest: float(function(torch.tensor(first), torch.tensor(second), *map(float, rest)))
 
 
 FUNCTIONS: dict[str, Operation] = {
@@ -62,6 +68,8 @@ FUNCTIONS: dict[str, Operation] = {
     "fmod": Operation(torch.fmod, np.fmod, 2),
     "copysign": Operation(_copysign, np.copysign, 2),
     "where": Operation(torch.where, np.where, 3),
+    "normal_force": Operation(normal_force, _on_numbers(normal_force), 5, tensors=2),
+    "friction_force": Operation(friction_force, _on_numbers(friction_force), 4, tensors=2),
 }  # fmt: skip
 CONSTANTS = {"pi": math.pi}
 
@@ -331,7 +339,10 @@ def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Numbe
     if operation == "where":
         condition, *values = operands
         return torch.where(_as_condition(condition, like), *(_tensor(_as_number(each, like), like) for each in values))
-    return _OPERATIONS[operation].of_tensors(*(_tensor(_as_number(each, like), like) for each in operands))
+    found = _OPERATIONS[operation]
+    numbers = [_as_number(each, like) for each in operands]
+    count = len(numbers) if found.tensors is None else found.tensors
+    return found.of_tensors(*(_tensor(each, like) for each in numbers[:count]), *numbers[count:])
 
 
 def _factors(operation: str, depends: Sequence[bool]) -> list[int] | None:

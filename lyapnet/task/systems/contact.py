@@ -1,0 +1,87 @@
+"""Contact as parts of f(x): a compliant normal force and regularised friction, smooth by a stated length and speed.
+
+Both are means over a blur: with ξ of density ¾(1 − ξ²) on [−1, 1],
+
+    (z)₊ = E max(0, z + ξ),    sgn(z) = E sign(z + ξ),
+
+which are polynomials for |z| < 1, and max(0, z) and sign(z) themselves elsewhere. (z)₊ has two continuous derivatives,
+sgn(z) has one. Only clamp, products and sums occur, so certificates, C and CasADi know them.
+"""
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError
+
+Number = float | Tensor
+
+
+def normal_force(
+    gap: Tensor, gap_rate: Tensor, stiffness: Number, damping: Number = 0.0, length: Number = 1e-3
+) -> Tensor:
+    """The force by which two bodies push each other apart, N = k ℓ(−d/ℓ)₊ max(0, 1 − c ḋ) ≥ 0.
+
+    It is Hunt and Crossley's force, with the depth max(0, −d) rounded within ±ℓ of touching. It differs from the sharp
+    one by at most 3kℓ/16, at d = 0, and nowhere that |d| ≥ ℓ. The slope by d is between −k and 0, at c = 0. Without
+    damping it conserves energy; with c > 0 it only takes energy away, and a body that meets another at a speed v leaves
+    it at about v(1 − ⅔ c v).
+
+    Args:
+        gap: d in m, negative where the bodies overlap, (*batch,).
+        gap_rate: ḋ in m/s, (*batch,).
+        stiffness: k in N/m.
+        damping: c in s/m.
+        length: ℓ in m, positive; a number, or a tensor as a parameter of a family is.
+
+    Returns:
+        N in N, (*batch,); it never pulls.
+
+    Raises:
+        UsageError: the length is no positive number.
+
+    Source: Hunt, Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", Journal of Applied
+    Mechanics 1975.
+    """
+    _require_positive("length", length)
+    return stiffness * length * _smooth_ramp(-gap / length) * torch.relu(1 - damping * gap_rate)
+
+
+def friction_force(slip: Tensor, normal: Tensor, coefficient: Number, speed: Number = 1e-2) -> Tensor:
+    """Coulomb's friction on a body that slips, −μN sgn(v/v_s), in the direction of v.
+
+    It is Coulomb's force exactly where |v| ≥ v_s, and never adds energy. Within ±v_s it is viscous, of slope −3μN/(2v_s)
+    at rest: what should stick creeps, at about ⅔ v_s F/(μN) under a small load F.
+
+    Args:
+        slip: v, speed of the body relative to what it rubs on, in m/s, (*batch,).
+        normal: N ≥ 0 in N, (*batch,).
+        coefficient: μ.
+        speed: v_s in m/s, positive; a number, or a tensor as a parameter of a family is.
+
+    Returns:
+        the force in N, (*batch,).
+
+    Raises:
+        UsageError: the speed is no positive number.
+    """
+    _require_positive("speed", speed)
+    return -coefficient * normal * _smooth_sign(slip / speed)
+
+
+def _smooth_ramp(z: Tensor) -> Tensor:
+    """(z)₊ = E max(0, z + ξ) = (1 + z)³(3 − z)/16 for |z| < 1."""
+    within = z.clamp(-1, 1)
+    return (1 + within) ** 3 * (3 - within) / 16 + torch.relu(z - 1)
+
+
+def _smooth_sign(z: Tensor) -> Tensor:
+    """sgn(z) = E sign(z + ξ) = z(3 − z²)/2 for |z| < 1."""
+    within = z.clamp(-1, 1)
+    return within * (3 - within**2) / 2
+
+
+def _require_positive(name: str, value: Number) -> None:
+    if not isinstance(value, Tensor) and not value > 0:
+        raise UsageError(
+            f"Expected a positive {name} that contact is smooth by, got {value}; a small one, as 1e-6, is hard contact."
+        )

@@ -34,6 +34,7 @@ class ControlSystem(nn.Module, ABC):
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
     constants: Sequence[int] = ()  # indices of constant states, the parameters of a family
+    contact_lengths: Sequence[str] = ()  # attributes by which contact is smooth; the search for optima begins with more
     settings: Sequence[int] = ()  # states that are told, as no reading tells them: targets, the time on a reference
 
     @abstractmethod

@@ -9,7 +9,7 @@ sgn(z) has one. Only clamp, products and sums occur, so certificates, C and CasA
 """
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.base.errors import UsageError
 
@@ -49,8 +49,8 @@ def normal_force(
 def friction_force(slip: Tensor, normal: Tensor, coefficient: Number, speed: Number = 1e-2) -> Tensor:
     """Coulomb's friction on a body that slips, −μN sgn(v/v_s), in the direction of v.
 
-    It is Coulomb's force exactly where |v| ≥ v_s, and never adds energy. Within ±v_s it is viscous, of slope −3μN/(2v_s)
-    at rest: what should stick creeps, at about ⅔ v_s F/(μN) under a small load F.
+    It is Coulomb's force exactly where |v| ≥ v_s, and never adds energy. Within ±v_s it is viscous, with the slope
+    −3μN/(2v_s) at rest: what should stick creeps, at about ⅔ v_s F/(μN) under a small load F.
 
     Args:
         slip: v, speed of the body relative to what it rubs on, in m/s, (*batch,).
@@ -85,3 +85,20 @@ def _require_positive(name: str, value: Number) -> None:
         raise UsageError(
             f"Expected a positive {name} that contact is smooth by, got {value}; a small one, as 1e-6, is hard contact."
         )
+
+
+def variable_lengths(module: nn.Module) -> list[tuple[Tensor, float]]:
+    """Make the lengths of all contacts in a module buffers, and return each with its value.
+
+    Args:
+        module: a copy, such as of a problem; its systems name these parameters in `contact_lengths`.
+    """
+    found = list[tuple[Tensor, float]]()
+    for system in module.modules():
+        for name in getattr(system, "contact_lengths", ()):
+            value = getattr(system, name)
+            if isinstance(value, float | int):
+                delattr(system, name)
+                system.register_buffer(name, torch.tensor(float(value), dtype=torch.float64), persistent=False)
+                found.append((getattr(system, name), float(value)))
+    return found

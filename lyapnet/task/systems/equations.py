@@ -72,6 +72,10 @@ class EquationSystem(ControlSystem):
             if isinstance(parameters[name], bool) or not isinstance(parameters[name], int | float):
                 raise UsageError(f"Expected a number for system.parameters.{name}, got {parameters[name]!r}; give one.")
             setattr(self, self.attribute_of(name), parameters[name])
+        lengths = self.formulas.names_at({"normal_force": 4, "friction_force": 3})
+        self.contact_lengths: list[str] = [
+            self.attribute_of(name) for name in definition.parameters if joined(name) in lengths
+        ]
 
     @property
     def affine(self) -> bool:

@@ -153,6 +153,11 @@ class Formulas:
         found = self._computed(values, chosen, like)
         return [_filled(found[place], like) for place in chosen]
 
+    def names_at(self, places: Mapping[str, int]) -> set[str]:
+        """The names that stand alone as an operand of some operations: operation ↦ which operand, from 0."""
+        used = {operands[places[each]] for each, operands in self.instructions.values() if each in places}
+        return {self.names[place] for place in used if place < len(self.names)}
+
     def slopes(self, values: Mapping[str, Number], like: Tensor) -> list[list[Tensor]]:
         """[b_1, …, b_m] of each result c + Σ_j b_j u_j, if they are affine; what b needs alone is computed."""
         slopes: dict[int, dict[int, Number]] = {self.names.index(u): {j: 1.0} for j, u in enumerate(self.controls)}

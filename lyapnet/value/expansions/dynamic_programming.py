@@ -31,6 +31,7 @@ from lyapnet.task.cost import PenaltyCost, spread, squared_distance, time_cost_o
 from lyapnet.task.noise import Noise, once_if_constant
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
+from lyapnet.task.systems.contact import variable_lengths
 from lyapnet.value.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
 from lyapnet.value.expansions.gains import as_matrix, cost_beside, gain_of_node, regularise
 from lyapnet.value.expansions.laws import Expansion, certainty_equivalents, greedy_law
@@ -48,6 +49,8 @@ GRACE_ITERATIONS = 20  # first iterations in which none is given up
 SOFTNESS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # ρ of softer costs of controls, in units of that of their kinks
 NARROWING = 3.0  # factor between the distances at which consecutive costs of time end
 WIDENING_STATES = 256  # states of X₀ whose distance from the goal is that of the first
+LONGER = (300.0, 100.0, 30.0, 10.0, 3.0)  # factors of the lengths by which contacts are smooth, from soft to hard
+UNREACHED = 1e300  # cost of a path that is none of the problem, so that any trajectory found from it is better
 TRIES = 9  # consecutive failed line searches, each with ten times the damping, after which a trajectory is given up
 
 
@@ -138,7 +141,7 @@ def optimal_trajectories(
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
         return path_under(problem, lambda n, _: controls[n], x0)
 
-    def descend(programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
+    def descend(programs: StepPrograms, now: Path, curved: bool, kind: int, until: float = until) -> "_Descent":
         descent = _Descent(programs, now, curved)
         descent.run(iterations, rivals, lambda count: progress((kind * b + count) // kinds, b), until)
         return descent
@@ -153,7 +156,10 @@ def optimal_trajectories(
     if softer_first and (stages := _softer_costs(problem)):
         now = cheapest([now, under(_from_softer_costs(problem, stages, under, descend, now.u))])
     programs = StepPrograms(problem, STEP_SIZES)
+    softer = _from_softer_contact(problem, now, descend, seconds) if softer_first else None
     now = descend(programs, now, curved=False, kind=kinds - 2).now
+    if softer is not None:
+        now = cheapest([now, _reached(descend(programs, _as_guess(softer), curved=False, kind=kinds - 2))])
     descent = descend(programs, now, curved=True, kind=kinds - 1)
     if not programs.agrees(descent.now) and programs.forget():  # the problem's constants have changed
         problem = problem if noise is None else problem.replaced(noise=noise)
@@ -206,6 +212,43 @@ def _from_softer_costs(
             time.widening.fill_(stage.widening)
         u = descend(programs, under(u, softer), curved=False, kind=0).now.u
     return u
+
+
+def _from_softer_contact(
+    problem: Problem, guess: Path, descend: Callable[..., "_Descent"], seconds: float
+) -> Path | None:
+    """Paths that are optimal for contact within three times its length, from longer ones; None without contact.
+
+    A hard contact that is not met has no slope, and one that is met sends trajectories elsewhere; within a long length
+    it pushes from afar. At each length the descent begins from the path of the length before, and from the first guess
+    again: the cheaper goes on. A path is handed on with its states, as one that the next backward pass bends into a
+    trajectory; controls alone would lead elsewhere once the forces differ.
+    """
+    softer = copied(problem)
+    lengths = variable_lengths(softer)
+    if not lengths:
+        return None
+    programs, best = StepPrograms(softer, STEP_SIZES), None
+    share = seconds / (2 * len(LONGER) + 2)
+    for factor in LONGER:
+        for length, value in lengths:
+            length.fill_(factor * value)
+        starts = [_as_guess(path) for path in (guess, best) if path is not None]
+        if softer.has_goal:
+            starts.append(path_under(softer, greedy_law(softer, riccati(softer)), guess.x[0]))
+        best = cheapest([_reached(descend(programs, start, False, 0, time.thread_time() + share)) for start in starts])
+    return best
+
+
+def _as_guess(path: Path) -> Path:
+    """A path that need not be a trajectory, for a descent to begin with."""
+    return path._replace(cost=path.cost.where(~path.cost.isfinite(), UNREACHED))
+
+
+def _reached(descent: "_Descent") -> Path:
+    """Where a descent ended, with an infinite cost where it found no trajectory."""
+    now = descent.now
+    return now._replace(cost=now.cost.where(now.cost < UNREACHED, torch.inf))
 
 
 @torch.no_grad()

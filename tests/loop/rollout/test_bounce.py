@@ -1,4 +1,4 @@
-"""The exact gradient through one bounce: of a sharp contact alone it is noise, of a blurred start or a smooth one right.
+"""The exact gradient through one bounce: noise of a sharp contact, right of a blurred start or of a smooth contact.
 
 A ball of 1 kg is thrown down at 1 m/s from 0.4 m, onto a spring of 10⁴ N/m with a damper of 1 N·s/m, and is looked at
 after 0.5 s; steps of 0.5 ms, of the symplectic Euler method. The speeds differ by 1 % at most.

@@ -39,15 +39,14 @@ def ball(damping, length=1e-4, stiffness=1e4):
     return defined(BALL, {"height": "m", "speed": "m/s"}, {"push": "N"}, list(values))(**values)
 
 
-def bounce(system, speed, dt=2e-5, gravity=9.81):
-    """Energies of a ball of 1 kg that falls from 0.01 m at a speed, without the contact's own, until it is back."""
-    x, energies = torch.tensor([0.01, -speed], dtype=torch.float64), []
+def energy_after_a_bounce(system, speed, dt=2e-5, gravity=9.81):
+    """The energy of a ball of 1 kg that falls from 0.01 m at a speed, once it is back."""
+    x = torch.tensor([0.01, -speed], dtype=torch.float64)
     u = torch.zeros(1, dtype=torch.float64)
     while x[0] < 0.0101:
         half = x + dt / 2 * system.dynamics(x, u)
         x = x + dt * system.dynamics(half, u)
-        energies.append(float(gravity * x[0] + x[1] ** 2 / 2))
-    return energies, x
+    return float(gravity * x[0] + x[1] ** 2 / 2)
 
 
 def test_the_normal_force_is_the_sharp_one_beyond_its_length_and_near_it_within():
@@ -94,8 +93,7 @@ def test_contact_never_pulls_and_friction_never_drives():
 
 @pytest.mark.parametrize("damping", [0.0, 0.05, 0.2])
 def test_energy_never_grows_in_a_bounce(damping):
-    energies, x = bounce(ball(damping), 2.0)
-    before, after = 9.81 * 0.01 + 2.0, energies[-1]
+    before, after = 9.81 * 0.01 + 2.0, energy_after_a_bounce(ball(damping), 2.0)
     assert after <= before * (1 + 1e-6)
     if not damping:
         assert after > before * (1 - 1e-4)
@@ -106,8 +104,7 @@ def test_energy_never_grows_in_a_bounce(damping):
 
 
 def test_energy_grows_with_a_damper_of_the_wrong_sign():
-    energies, _ = bounce(ball(-0.05), 2.0)
-    assert energies[-1] > 9.81 * 0.01 + 2.0 + 0.1
+    assert energy_after_a_bounce(ball(-0.05), 2.0) > 9.81 * 0.01 + 2.0 + 0.1
 
 
 def test_small_loads_creep():

@@ -1,0 +1,52 @@
+"""A controller's costs from published starts, beside optima: python -m tests.contact_tasks.starts CKPT pushing_1000.
+
+The optimum is the cheapest of differential dynamic programming from the law's controls, from softer contacts, and
+IPOPT from its own guesses and from these.
+"""
+
+import sys
+
+import torch
+
+import lyapnet
+from lyapnet.evaluation.oracles import optimal_cost
+from lyapnet.value.expansions import greedy_law, in_float64, optimal_trajectories, path_under, riccati
+
+STARTS = {  # x₀ ↦ the best cost that was known, of five guesses
+    "pushing_10": {(0, 1, 0, 0): 823.70},
+    "pushing_100": {(0, 1, 0, 0): 786.95},
+    "pushing_1000": {(0, 1, 0, 0): 801.81},
+    "walls_right": {(0.2, 0, 0.3, 0): 193.9, (0.3, 0, 0.6, 0): 1204.7, (0.3, -0.1, 0.5, 0): 695.3},
+    "walls_tilted": {(0, 0.35, 0, 0): 403.6},
+    "walls_left": {(-0.3, 0.2, 0, 0): 1774.3},
+    "walls_fast": {(0.3, 0, 1, 0): 4290.7},
+}
+
+
+def best_of(problem, x0, u):
+    """The least cost found from each start, and that of IPOPT."""
+    laws = path_under(problem, greedy_law(problem, riccati(problem)), x0).u
+    optima = [
+        optimal_trajectories(problem, x0, controls, softer_first=soft)
+        for controls, soft in ((u, False), (u, True), (laws, True))
+    ]
+    costs = torch.stack([each.path.cost for each in optima])
+    best, rows = costs.argmin(0), torch.arange(len(x0))
+    oracle = optimal_cost(problem)
+    alone = torch.full_like(costs[0], torch.nan) if oracle is None else oracle.solve(x0).cost
+    known = torch.stack([each.path.u for each in optima])[best, :, rows].movedim(0, 1)
+    given = alone if oracle is None else oracle.solve(x0, known=known).cost
+    return torch.stack([costs.amin(0), alone.nan_to_num(torch.inf), given.nan_to_num(torch.inf)]).amin(0), alone
+
+
+if __name__ == "__main__":
+    controller, starts = lyapnet.load(sys.argv[1]), STARTS[sys.argv[2]]
+    x0 = torch.tensor([*starts], dtype=torch.float64)
+    loop = controller.rollout(x0)
+    best, ipopt = best_of(in_float64(controller.problem), x0, loop.u)
+    rows = zip(starts.items(), loop.cost.tolist(), best.tolist(), ipopt.tolist(), controller.value(0.0, x0).tolist())
+    for (x, published), cost, optimum, alone, value in rows:
+        print(
+            f"{x}: law {cost:.2f}, V {value:.2f}, optimum {optimum:.2f}, IPOPT alone {alone:.2f}, published {published}; "
+            f"law / optimum {cost / optimum:.4f}, law / published {cost / published:.4f}"
+        )

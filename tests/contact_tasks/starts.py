@@ -1,7 +1,8 @@
 """A controller's costs from published starts, beside optima: python -m tests.contact_tasks.starts CKPT pushing_1000.
 
 The optimum is the cheapest of differential dynamic programming from the law's controls, from softer contacts, and
-IPOPT from its own guesses and from these.
+IPOPT from its own guesses and from these. With `walls 64` in the place of a name: the shares of 64 states of X₀ from
+which the law leans on a wall where the optimum does, and costs at most 1.05 times as much.
 """
 
 import sys
@@ -10,7 +11,7 @@ import torch
 
 import lyapnet
 from lyapnet.evaluation.oracles import optimal_cost
-from lyapnet.value.expansions import greedy_law, in_float64, optimal_trajectories, path_under, riccati
+from lyapnet.value.expansions import cheapest, greedy_law, in_float64, optimal_trajectories, path_under, riccati
 
 STARTS = {  # x₀ ↦ the best cost that was known, of five guesses
     "pushing_10": {(0, 1, 0, 0): 823.70},
@@ -21,6 +22,29 @@ STARTS = {  # x₀ ↦ the best cost that was known, of five guesses
     "walls_left": {(-0.3, 0.2, 0, 0): 1774.3},
     "walls_fast": {(0.3, 0, 1, 0): 4290.7},
 }
+
+
+def leans(x):
+    """Whether the tip of the pole meets a wall, of paths (N + 1, b, 4)."""
+    return (x[..., 0] - 0.6 * x[..., 1]).abs().amax(0) > 0.35
+
+
+def report_shares(controller, count):
+    """Print on how many states of X₀ the law takes the family of the best optimum found."""
+    problem = in_float64(controller.problem)
+    x0 = problem.initial_states.sample(count, torch.Generator().manual_seed(123)).double()
+    loop = controller.rollout(x0)
+    linear = path_under(problem, greedy_law(problem, riccati(problem)), x0).u
+    paths = [
+        optimal_trajectories(problem, x0, u, softer_first=soft).path for u, soft in ((loop.u, False), (linear, True))
+    ]
+    best = cheapest(paths)
+    ratio, same = loop.cost / best.cost, leans(loop.x) == leans(best.x)
+    print(
+        f"{count} states of X₀: mean cost / mean best {float(loop.cost.mean() / best.cost.mean()):.4f}, worst "
+        f"{float(ratio.max()):.3f}, within 1.05: {float((ratio <= 1.05).double().mean()):.0%}, the same family: "
+        f"{float(same.double().mean()):.0%}, leaning is best: {float(leans(best.x).double().mean()):.0%}"
+    )
 
 
 def best_of(problem, x0, u):
@@ -39,14 +63,29 @@ def best_of(problem, x0, u):
     return torch.stack([costs.amin(0), alone.nan_to_num(torch.inf), given.nan_to_num(torch.inf)]).amin(0), alone
 
 
-if __name__ == "__main__":
-    controller, starts = lyapnet.load(sys.argv[1]), STARTS[sys.argv[2]]
+def report_starts(controller, starts):
+    """Print the costs of the law from some starts, beside optima."""
     x0 = torch.tensor([*starts], dtype=torch.float64)
     loop = controller.rollout(x0)
     best, ipopt = best_of(in_float64(controller.problem), x0, loop.u)
-    rows = zip(starts.items(), loop.cost.tolist(), best.tolist(), ipopt.tolist(), controller.value(0.0, x0).tolist())
+    rows = zip(
+        starts.items(),
+        loop.cost.tolist(),
+        best.tolist(),
+        ipopt.tolist(),
+        controller.value(0.0, x0).tolist(),
+        strict=True,
+    )
     for (x, published), cost, optimum, alone, value in rows:
         print(
-            f"{x}: law {cost:.2f}, V {value:.2f}, optimum {optimum:.2f}, IPOPT alone {alone:.2f}, published {published}; "
-            f"law / optimum {cost / optimum:.4f}, law / published {cost / published:.4f}"
+            f"{x}: law {cost:.2f}, V {value:.2f}, optimum {optimum:.2f}, IPOPT alone {alone:.2f}, published "
+            f"{published}; law / optimum {cost / optimum:.4f}, law / published {cost / published:.4f}"
         )
+
+
+if __name__ == "__main__":
+    loaded = lyapnet.load(sys.argv[1])
+    if sys.argv[2] == "walls":
+        report_shares(loaded, int(sys.argv[3]))
+    else:
+        report_starts(loaded, STARTS[sys.argv[2]])

@@ -51,11 +51,11 @@ def turning():
     return map_of([[c, -s], [s, c]])
 
 
-def claimed(about, states, V=square, decay=None, boxes=4000, policy=HJBPolicy, steps=True, **options):
+def claimed(about, states, V=square, decay=None, boxes=4000, policy=HJBPolicy, steps=True, seconds=AMPLE, **options):
     V = Formula(V) if not isinstance(V, Formula) else V
     loop = ClosedLoop(about, policy(about, V))
     ends = Box(*(torch.tensor(side, dtype=torch.float64) for side in states))
-    return prove_region(loop, about, decay, ends, Budget(AMPLE, boxes, chunk=256), steps=steps, **options)
+    return prove_region(loop, about, decay, ends, Budget(seconds, boxes, chunk=256), steps=steps, **options)
 
 
 UNIT = ([-1.0, -1.0], [1.0, 1.0])
@@ -74,6 +74,7 @@ def test_of_a_turning_map_the_largest_level_is_proved_beyond_the_circle_in_the_s
     assert claim.volume <= area
 
 
+@pytest.mark.gate
 def test_its_contraction_is_that_of_the_map():
     """‖F(x) − F(x')‖ = 0.9 ‖x − x'‖, so that κΔt is (1 − 0.81)/2, at least as little as 1 − 0.9."""
     found = claimed(turning(), UNIT).contraction
@@ -110,6 +111,7 @@ def test_euler_steps_that_diverge_are_not_certified_though_continuous_time_is(A)
     assert claimed(finer, states).verdict == "certified"
 
 
+@pytest.mark.gate
 def test_the_method_of_the_steps_counts():
     """With Δt = 0.1 the slow spiral grows in Euler steps, and shrinks in those of Runge and Kutta."""
     A = [[-0.1, 5.0], [-5.0, -0.1]]
@@ -119,6 +121,7 @@ def test_the_method_of_the_steps_counts():
     assert claim.steps.method == "rk4"
 
 
+@pytest.mark.gate
 def test_an_unstable_continuous_loop_whose_steps_are_stable_is_certified():
     """A held control may stabilise what the same gain read at every t does not need to: claims are not mixed up."""
     A, B = torch.tensor([[1.0, DT], [0.0, 1.0]]), torch.tensor([[0.0], [DT]])
@@ -140,11 +143,12 @@ def test_an_unstable_continuous_loop_whose_steps_are_stable_is_certified():
     assert 0.94 * first < claim.rho <= first * (1 + 1e-9), "the least V from which a step leaves D"
 
 
+@pytest.mark.gate
 def test_a_fixed_point_beside_the_goal_is_not_taken_for_the_hole():
     """V = x²(x − 2)² has a second well, where the steps stay too."""
     about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
     V = Formula(lambda t, x: (x[..., 0] * (x[..., 0] - 2)) ** 2 + 0 * t)
-    assert claimed(about, ([-1.0], [3.0]), V).rho == -math.inf
+    assert claimed(about, ([-1.0], [3.0]), V, seconds=5).rho == -math.inf, "where V has no lower bound above 0"
     assert claimed(about, ([-0.9], [0.9]), V).verdict == "certified"
 
 
@@ -275,6 +279,7 @@ def test_V_that_pays_for_each_step_bounds_what_the_steps_cost():
     assert found.result["steps"] == "0.1 s, euler"
 
 
+@pytest.mark.gate
 def test_V_that_pays_for_too_little_of_a_step_is_falsified():
     assert funnel(payer(0.9)).verdict == "falsified"
     assert funnel(payer(0.9), alpha=0.8, delta=0.1).verdict == "certified"

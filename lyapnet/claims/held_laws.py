@@ -14,6 +14,12 @@ from lyapnet.task.systems import ControlSystem
 from lyapnet.task.varying_limits import VaryingLimits
 
 
+def given_of_held(claim: ReadAtTimes) -> list[str]:
+    """The options of a claim that are about a held law."""
+    names = ("interval", "jitter", "delay", "measured", "quantised", "file")
+    return [name for name in names if getattr(claim, name, None)]
+
+
 def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:
     """When the law is read, and how far this may be off; None for a claim about u read at every t.
 
@@ -26,8 +32,7 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
             limits depend on the state.
     """
     problem, system = controller.problem, controller.system
-    names = ("interval", "jitter", "delay", "measured", "quantised", "file")
-    given = [name for name in names if getattr(claim, name, None)]
+    given = given_of_held(claim)
     refused = _reason_against(problem)
     time = claim.time or ("held" if given or (made_for == "held" and refused is None) else "continuous")
     if time != "held":

@@ -256,7 +256,8 @@ class Region(ReadAtTimes):
 
     With a disturbance, it is a set that no closed loop leaves, and a smaller set that each closed loop enters and never
     leaves. With parameters, it holds for every plant whose constant parameters lie in the given intervals.
-    Without `time` it is about steps if V was trained for these, and otherwise u is read at every t.
+    Without `time` it is about steps if V was trained for these and no option is about continuous time; otherwise u is
+    read at every t.
     lyapnet.claims.region.ProvedRegion states the conditions.
     """
 
@@ -299,9 +300,12 @@ class Region(ReadAtTimes):
         Raises:
             UsageError: it is, with a disturbance.
         """
-        held = self.interval or self.jitter or self.delay or self.measured or self.quantised or self.disturbance
-        made_for = getattr(controller.program, "steps", False) and not held
-        steps = self.time == "steps" or (self.time is None and made_for)
+        from lyapnet.claims.held_laws import given_of_held
+        from lyapnet.loop.programs import RegionProgram
+
+        made_for = isinstance(controller.program, RegionProgram) and controller.program.steps
+        continuous = self.disturbance or given_of_held(self)
+        steps = self.time == "steps" or (self.time is None and made_for and not continuous)
         if steps and self.disturbance:
             raise UsageError(
                 "Expected --time steps alone, got --disturbance, which is about continuous time; leave one of them out."

@@ -105,7 +105,7 @@ class ProvedRegion:
     least: float  # the largest V among samples of X₀
     hole: float  # c; 0 without a hole
     contraction: Contraction | None  # None if none is proved, and with a disturbance
-    slowest: float  # the largest real part among the eigenvalues of the linearised law, in 1/s; nan with a disturbance
+    slowest: float  # as contraction_around gives it, in 1/s; nan with a disturbance
     volume_share: float  # a lower bound of the share of X₀ in the region
     region_share: float  # a lower bound of the share of D in the region
     proof: Proof | None  # of the inequality for V̇; None without a hole
@@ -205,9 +205,10 @@ class ProvedRegion:
                 f"choose a smaller one, or a smaller decay{self._or_narrow}"
             )
         if self.verdict == "falsified":
+            leaves = "" if self.steps is None else ", or the step from there leaves D (then choose a larger set)"
             return (
-                "V(0, ·) does not fall at the rate λ there under u(0, ·): train on a longer horizon, or from states "
-                f"all around it, or choose a smaller decay{self._or_narrow}"
+                f"V(0, ·) does not fall at the rate λ there under u(0, ·){leaves}: train on a longer horizon, or from "
+                f"states all around it, or choose a smaller decay{self._or_narrow}"
             )
         if self.proof is not None and self.proof.remaining_volume > 0:
             return f"{time_spent(self.set_up)}: allow more; boxes next to another equilibrium always stay undecided"

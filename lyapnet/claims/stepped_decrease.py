@@ -13,14 +13,15 @@ from lyapnet.claims.contraction import Contraction
 from lyapnet.claims.preconditions import append_constants, over_time
 from lyapnet.claims.receding_decrease import RecedingDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.branch_and_bound import Budget, minimum
+from lyapnet.prover.branch_and_bound import Budget, just_below, minimum
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-WITHIN = 1e-12  # by which F(x) has to lie in D, relative to the half widths of D, for the rounding of these
+WITHIN = 1e-12  # by which F(x) has to lie in D, relative to its half widths, and ROUNDING, relative to its ends: more
+ROUNDING = 2**-50  # than middles and half widths are rounded by
 
 
 class Stepped(DecreaseCondition):
@@ -30,7 +31,7 @@ class Stepped(DecreaseCondition):
     """
 
     problem: Problem
-    sides: Sequence[tuple[int, float, float]]  # (axis, middle, half width) of D where it has bounds
+    sides: Sequence[tuple[int, float, float]]  # (axis, middle, half width, a little less) of D where it has bounds
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -38,8 +39,11 @@ class Stepped(DecreaseCondition):
 
     def keep_within(self, states: Box, axes: Sequence[int]) -> None:
         """Require F(x, u) ∈ D along some axes: those with bounds, without constants."""
-        ends = zip(states.center.tolist(), (states.widths / 2).tolist(), strict=True)
-        self.sides = [(i, middle, half) for i, (middle, half) in enumerate(ends) if i in axes]
+        self.sides = []
+        for i in sorted(axes):
+            low, high = float(states.lower[i]), float(states.upper[i])
+            half = (high - low) / 2
+            self.sides.append((i, (low + high) / 2, half - WITHIN * half - ROUNDING * max(abs(low), abs(high))))
 
     def after(self, x: State, u: Control) -> State:
         """F(x, u)."""
@@ -47,7 +51,7 @@ class Stepped(DecreaseCondition):
 
     def outside(self, after: State) -> PerState:
         """How far a state is outside of D, relative to D; at most 0 in D."""
-        beyond = [(after[..., i] - middle).abs() / half - (1 - WITHIN) for i, middle, half in self.sides]
+        beyond = [(after[..., i] - middle).abs() / half - 1 for i, middle, half in self.sides]
         return reduce(torch.maximum, beyond) if beyond else torch.full_like(after[..., 0], -1.0)
 
     def values(self, points: Points) -> tuple[PerState, PerState]:
@@ -129,7 +133,7 @@ class IntoTheHole(Constraints):
     def __init__(self, condition: SteppedDecrease):
         super().__init__()
         self.of = [condition]  # no module of its own: the condition has this one
-        self.level = condition.hole - condition.hole * condition.decay * condition.problem.horizon.dt
+        self.level = just_below(condition.hole * (1 - condition.decay * condition.problem.horizon.dt))
 
     def forward(self, x: State) -> Tensor:
         (condition,) = self.of

@@ -83,8 +83,8 @@ def identify(
         residual = identify_residual(resolved, given, found, held, held_out, report=report) if with_residual else None
         report("writing")
         key = "family" if family else "randomise"
-        names = [path.name for path in files]
-        text, note = identified_yaml(config, overrides, resolved, found, target, key, names, residual)
+        sources = [path.name for path in files]
+        text, note = identified_yaml(config, overrides, resolved, found, target, key, sources, residual)
         write_atomically(target, text.encode())
         picture = target.with_suffix(".png")
         measured_and_fitted(found).savefig(picture, dpi=150)
@@ -92,8 +92,8 @@ def identify(
     unread = [
         f"{each.name}: columns that are not read: {', '.join(map(repr, each.unread))}" for each in given if each.unread
     ]
-    unread += [note, *([] if residual is None else residual_sentences(residual))]
-    _tell(found, f"{config.name}, from {', '.join(path.name for path in files)}", unread, as_json, files, residual)
+    told = [*unread, note, *([] if residual is None else residual_sentences(residual))]
+    _tell(found, f"{config.name}, from {', '.join(sources)}", told, as_json, files, residual)
     notes = Console(stderr=as_json, highlight=False, markup=False)
     notes.print(f"wrote {target} and {picture}", soft_wrap=True)
 

@@ -46,7 +46,10 @@ FirstDeviation = Annotated[
 ]
 Delay = Annotated[
     int | None,
-    typer.Option(help="With an estimator: steps of Δt after its readings at which a control acts.", metavar="STEPS"),
+    typer.Option(
+        help="With an estimator: steps of Δt after its readings at which a control acts (certify's is in s).",
+        metavar="STEPS",
+    ),
 ]
 OWN = {
     "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",

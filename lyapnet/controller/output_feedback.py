@@ -32,7 +32,7 @@ class OutputFeedback:
 
     With a delay of d steps a control acts from d Δt after its readings on. Which controls act until then is known, so
     that it is u(t_k + dΔt, x̂) at the state x̂ that the model predicts for that time; at first u at rest acts. For a
-    plant like the model that is the best law from dΔt on.
+    plant like the model, without noise, that is the best law from dΔt on if V is optimal.
 
     Args:
         law: u(t, x) with its V, for all t ≥ 0.

@@ -122,7 +122,7 @@ def test_a_law_that_is_made_to_be_held_is_held_in_the_claim():
         ({"measured": {"x2": 0.1}}, "Expected the error of x1, got 'x2=0.1'"),
         ({"quantised": {"x1": 0.1}}, "Expected steps of u1, got 'x1'"),
         ({"measured": {"x1": -0.1}}, "Expected errors as numbers ≥ 0"),
-        ({"time": "steps"}, "Expected time as continuous or held, got 'steps'"),
+        ({"time": "often"}, "Expected time as continuous, held or steps, got 'often'"),
         ({"delay": -0.1}, "Expected delay ≥ 0"),
     ],
 )

@@ -34,8 +34,9 @@ Traced = dict[str, tuple[str, GraphModule, dict[str, Tensor], list[str]]]
 
 
 class LoopTraces:
-    """The parts of an estimator's loop, traced: predict (x, P, u) ↦ (x', P'), correct (x, P, y) ↦ (x', P'), and
-    take_off (u, x) ↦ u − d̂ within the limits for the law's u, where disturbances d are estimated.
+    """The parts of an estimator's loop, traced: predict (x, P, u) ↦ (x', P'), correct (x, P, y) ↦ (x', P');
+    with a delay ahead (x, u) ↦ x'; and take_off (u, x) ↦ u − d̂ within the limits for the law's u, where disturbances d
+    are estimated.
 
     Args:
         loop: with a Kalman filter that has rules in C: ekf.
@@ -62,6 +63,9 @@ class LoopTraces:
         def correct(x: Tensor, P: Tensor, y: Tensor) -> tuple[Tensor, ...]:
             return tuple(loop.corrected(Belief(x, P), y))
 
+        def ahead(x: Tensor, u: Tensor) -> tuple[Tensor, ...]:
+            return (problem.step(x, u)[0],)
+
         def take_off(u: Tensor, x: Tensor) -> tuple[Tensor, ...]:
             return (loop.without_disturbances(u, x),)
 
@@ -69,6 +73,8 @@ class LoopTraces:
             "predict": self._traced(predict, {"x": x, "P": P, "u": u}, ["x_next", "P_next"]),
             "correct": self._traced(correct, {"x": x, "P": P, "y": y}, ["x_next", "P_next"]),
         }  # fmt: skip
+        if loop.delay:
+            self._parts["ahead"] = self._traced(ahead, {"x": x, "u": u}, ["x_next"])
         if loop.d_hat.shape[-1]:
             self._parts["take_off"] = self._traced(take_off, {"u": u, "x": x}, ["u_next"])
 
@@ -219,7 +225,7 @@ void @NAME_reset(@NAME_loop *loop)
 int @NAME_applied(@NAME_loop *loop, const double u[@M])
 {
     if (!is_finite(@M, u)) return @MACRO_NOT_FINITE;
-    for (int i = 0; i < @M; i++) loop->u[i] = u[i];
+    for (int i = 0; loop->calls > 0 && i < @M; i++) loop->u[i] = u[i];
     return 0;
 }
 
@@ -271,7 +277,7 @@ AHEAD = """    clock = (double)((WIDE)clock + (WIDE)@DELAY * @DT);
     double ahead[@N];
     for (int i = 0; i < @N; i++) ahead[i] = loop->x[i];
     for (int j = 0; j < @DELAY; j++) {
-        predict_of(ahead, loop->P, j == 0 ? loop->u : loop->later[j - 1], x, P);
+        ahead_of(ahead, j == 0 ? loop->u : loop->later[j - 1], x);
         for (int i = 0; i < @N; i++) ahead[i] = x[i];
     }
 """

@@ -102,12 +102,18 @@ def residual_sentences(residual: Residual) -> list[str]:
     network, (largest, slopes) = residual.network, residual.network.bounds()
     lines = [f"r(x) is needed: {told}."]
     for k, i in enumerate(network.rates):
-        each = ", ".join(f"{name} {slope:.3g}" for name, slope in zip(network.states, slopes[k], strict=True))
+        each = ", ".join(f"{name} {round_up(slope)}" for name, slope in zip(network.states, slopes[k], strict=True))
         lines.append(
-            f"r of {network.states[i]}: at most {largest[k]:.3g} on the box of these data, its slopes at most {each}; "
-            f"beyond the box it is a guess, at most {network.everywhere[k]:.3g}."
+            f"r of {network.states[i]}: at most {round_up(largest[k])} on the box of these data, its slopes at most "
+            f"{each}; beyond the box it is a guess, at most {round_up(network.everywhere[k])}."
         )
     return lines
+
+
+def round_up(bound: float) -> str:
+    """A number ≥ 0 with three digits, not below it."""
+    text = f"{bound:.3g}"
+    return text if float(text) >= bound else f"{bound + 10.0 ** (math.floor(math.log10(bound)) - 2):.3g}"
 
 
 def _residual_as_data(residual: Residual) -> dict[str, Any]:

@@ -110,8 +110,8 @@ class RegionCondition(PointwiseCondition):
 
     @torch.no_grad()
     def _leaving(self, generator: torch.Generator) -> tuple[State, Bool[Tensor, " points"]]:
-        """Points whose least V is ρ, and which of them count: points on the boundary of D; with steps, points up to a
-        step before it, where they are left with the next one.
+        """Points over which ρ is the least V, and whether each counts: on the boundary of D all of them; with steps,
+        points within a step of it, of which those count whose next state is outside D.
         """
         x = self._boundary(generator)
         if not self.program.steps:

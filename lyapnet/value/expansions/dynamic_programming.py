@@ -156,7 +156,7 @@ def optimal_trajectories(
     if softer_first and (stages := _softer_costs(problem)):
         now = cheapest([now, under(_from_softer_costs(problem, stages, under, descend, now.u))])
     programs = StepPrograms(problem, STEP_SIZES)
-    softer = _from_softer_contact(problem, now, descend, seconds) if softer_first else None
+    softer = _from_softer_contact(problem, now, descend, until) if softer_first else None
     now = descend(programs, now, curved=False, kind=kinds - 2).now
     if softer is not None:
         now = cheapest([now, _reached(descend(programs, _as_guess(softer), curved=False, kind=kinds - 2))])
@@ -215,21 +215,21 @@ def _from_softer_costs(
 
 
 def _from_softer_contact(
-    problem: Problem, guess: Path, descend: Callable[..., "_Descent"], seconds: float
+    problem: Problem, guess: Path, descend: Callable[..., "_Descent"], until: float
 ) -> Path | None:
     """Paths that are optimal for contact within three times its length, from longer ones; None without contact.
 
     A hard contact that is not met has no slope, and one that is met sends trajectories elsewhere; within a long length
-    it pushes from afar. At each length the descent begins from the path of the length before, and from the first guess
-    again: the cheaper goes on. A path is handed on with its states, as one that the next backward pass bends into a
-    trajectory; controls alone would lead elsewhere once the forces differ.
+    it pushes from afar. At each length descents begin from the path of the length before, from the first guess and from
+    the linear law: the cheapest goes on. A path is handed on with its states, as one that the next backward pass bends
+    into a trajectory; controls alone would lead elsewhere once the forces differ.
     """
     softer = copied(problem)
     lengths = variable_lengths(softer)
     if not lengths:
         return None
     programs, best = StepPrograms(softer, STEP_SIZES), None
-    share = seconds / (2 * len(LONGER) + 2)
+    share = (until - time.thread_time()) / (2 * 3 * len(LONGER))  # all of them take at most half of what is left
     for factor in LONGER:
         for length, value in lengths:
             length.fill_(factor * value)

@@ -156,6 +156,15 @@ def test_one_long_run_is_pythons_too(tmp_path):
 
 
 @pytest.mark.gate
+def test_what_was_applied_before_the_first_readings_has_no_meaning(tmp_path):
+    """At rest acts then, as in Python, also with a delay."""
+    loop = LOOPS["a delay"]()
+    found = compiled_loop(loop, tmp_path / "loop")
+    for _ in range(3):
+        assert found.step(np.array([0.3]), np.array([5.0])) == pytest.approx(loop.step([0.3], applied=[5.0]), rel=1e-9)
+
+
+@pytest.mark.gate
 def test_a_setting_that_changes_begins_the_horizon_anew(tmp_path):
     loop = LOOPS["settings"]()
     found = compiled_loop(loop, tmp_path / "loop")

@@ -16,7 +16,7 @@ from lyapnet.base.files import plain
 from lyapnet.base.types import State
 from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
-from lyapnet.claims.funnel import before_last_step, prove_funnel
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.noisy_certificate import NoisyCertificate
@@ -166,9 +166,7 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
     if kept.states.dimension == controller.system.n:  # otherwise the claim raises the error
         domain = over_time(kept.states, controller.horizon.duration)
         if isinstance(condition, SteppedPayment):
-            seen = [i for i in range(controller.system.n) if kept.states.widths[i] > 0]
-            condition.keep_within(kept.states, [i for i in seen if i not in controller.system.constants])
-            domain = before_last_step(controller.horizon, kept.states)
+            domain = condition.domain_of(kept.states, torch.nonzero(kept.states.widths == 0).flatten().tolist())
         box = condition.search_box(domain)
         KeptProof(path, about(bounded_condition(condition, domain, kept.degree), condition, *box), math.inf).claim(box)
     return kept

@@ -49,7 +49,6 @@ LEVELS = 60.0  # seconds at most
 LEAST = 1.0  # seconds at least
 SHARE_OF_LEVELS = 0.3  # share of the remaining budget
 SHARE_OF_FINISH = 0.15  # share of the remaining budget that is reserved for the share of X₀ and κ
-NODE = 1e-9  # of Δt, by which the time of the last step may be off by rounding
 KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command resumes it."
 NOT_KEPT = "Stopped while certifying: the proof is lost; the option keep writes it to a file."
 
@@ -200,9 +199,7 @@ def prove_funnel(
     needed = just_above(wanted)
     rim = float("inf") if steps else minimum(condition.height, *sides, levels, enough=just_above(needed))
     if isinstance(condition, SteppedPayment):
-        seen = [i for i in range(D.dimension) if i not in (*left_out, *loop.system.constants)]
-        condition.keep_within(D, seen)
-        domain = before_last_step(problem.horizon, D)
+        domain = condition.domain_of(D, left_out)
     begin = beginning_level(condition, at_time(0.0, x_low, x_high), budget_for_level(budget), just_above(needed))
     crossing = min(begin, crossing_level(condition, domain, budget_for_level(budget), just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
@@ -228,11 +225,6 @@ def prove_funnel(
         violation=violation, disturbance=disturbance, set_up=spent, assumed=assumed,
         readings=readings, steps=problem.horizon if steps else None,
     )  # fmt: skip
-
-
-def before_last_step(horizon: Horizon, states: Box) -> tuple[Corner, Corner]:
-    """[0, T − Δt] × D, or slightly more for the rounding of T − Δt."""
-    return over_time(states, horizon.duration - horizon.dt * (1 - NODE))
 
 
 def require_disturbance(w: State, n: int) -> None:

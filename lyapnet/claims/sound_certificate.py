@@ -17,7 +17,7 @@ from lyapnet.claims.certificates import (
     named_disturbance,
 )
 from lyapnet.claims.costs import CostCertificate, Inside
-from lyapnet.claims.funnel import ProvedFunnel, before_last_step
+from lyapnet.claims.funnel import ProvedFunnel
 from lyapnet.claims.held_laws import READINGS, computed_text, control_of, readings_facts, readings_text
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.preconditions import over_time
@@ -68,8 +68,7 @@ class SoundCertificate(CostCertificate):
         loop = copied(self.controller.closed_loop)
         if claim.steps is not None:
             condition = SteppedPayment(loop, claim.alpha, claim.delta, copied(self.controller.problem))
-            condition.keep_within(claim.states, [i for i in range(loop.system.n) if i not in claim.left_out])
-            return condition, before_last_step(claim.steps, claim.states), claim.wanted
+            return condition, condition.domain_of(claim.states, claim.left_out), claim.wanted
         condition = DecreaseCondition(
             loop, claim.alpha, claim.delta, disturbance=claim.disturbance, readings=claim.readings
         )

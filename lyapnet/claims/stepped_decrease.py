@@ -20,6 +20,7 @@ from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
+NODE = 1e-9  # of Δt, by which the time of the last step may be off by rounding
 WITHIN = 1e-12  # by which F(x) has to lie in D, relative to its half widths, and ROUNDING, relative to its ends: more
 ROUNDING = 2**-50  # than middles and half widths are rounded by
 
@@ -73,6 +74,13 @@ class SteppedPayment(Stepped):
     def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float, problem: Problem):
         super().__init__(closed_loop, alpha, delta)
         self.problem, self.sides = problem, []
+
+    def domain_of(self, states: Box, left_out: Sequence[int]) -> tuple[Corner, Corner]:
+        """Require F(x, u) ∈ D, but for states left out and constants; [0, T − Δt] × D, or more by the rounding of T."""
+        seen = [i for i in range(states.dimension) if i not in (*left_out, *self.closed_loop.system.constants)]
+        self.keep_within(states, seen)
+        horizon = self.problem.horizon
+        return over_time(states, horizon.duration - horizon.dt * (1 - NODE))
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         return self.parts_under(t, x, self.closed_loop.policy(t, x))

@@ -94,9 +94,12 @@ class RegionCondition(PointwiseCondition):
     def sampled_share(self, generator: torch.Generator) -> Float[Tensor, ""]:
         """The share of D in the largest {V ≤ ρ} on which V decreases, estimated from samples."""
         x, now = self.region.sample(VOLUME_SAMPLES, generator).to(self.goal), self.goal.new_zeros(())
-        value, failing = self.V(now, x), self.rate(now, x, self.closed_loop.policy(now, x)) >= 0
+        value = self.V(now, x)
         if self.program.steps:
-            failing |= self._outside(self._step(x))
+            after = self._step(x)
+            failing = (self.V(now, after) >= value) | self._outside(after)
+        else:
+            failing = self.rate(now, x, self.closed_loop.policy(now, x)) >= 0
         edge, leaving = self._leaving(generator)
         boundary = self.V(now, edge).where(leaving, torch.inf)
         level = torch.minimum(value.where(failing, torch.inf).min(), boundary.min())

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torch.func import vmap
 from torch.nn import functional
 
+from lyapnet.experiment.assembly.classes import default_dtype
 from lyapnet.prover import elementary_functions, taylor
 from lyapnet.prover.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.prover.bounds import BoundedFunction
@@ -25,8 +26,9 @@ AXES = 3
 WIDTHS = (2.0, 0.5, 0.1, 1e-2, 1e-3, 1e-5)
 INDEX, TWICE = torch.tensor([2, 0]), torch.tensor([2, 2])
 
-COST, LIMITS = ControlCosts([AbsoluteCost(0.3)]), ControlBox(-0.4, 0.2)
-FUEL = make_known(COST, LIMITS)
+with default_dtype(torch.float64):  # in float32 the limits are 4e-9 off
+    COST, LIMITS = ControlCosts([AbsoluteCost(0.3)]), ControlBox(-0.4, 0.2)
+    FUEL = make_known(COST, LIMITS)
 
 
 def least_fuel(b):

@@ -82,9 +82,9 @@ def test_another_machine_bounds_the_same_or_nothing():
     """The condition is pickled and traced again: the same boxes to the last bit, or an error."""
     pickle = pytest.importorskip("cloudpickle")
     condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
-    bounded = bounded_condition(condition, domain(), 1)
+    bounded = bounded_condition(condition, domain(), 1, torch.inf)
     question = WhereItHolds(condition, bounded, torch.inf, True)
-    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, proved_by(bounded))
+    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, torch.inf, proved_by(bounded))
     boxes, rounds = single(*domain()), 0
     while len(boxes.key):
         rounds += 1
@@ -96,7 +96,7 @@ def test_another_machine_bounds_the_same_or_nothing():
     function, sources, torchs = proved_by(bounded)
     for other in (("0" * 64, sources, torchs), (function, "0" * 64, torchs), (function, sources, "1.0")):
         with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
-            bounded_again(condition, domain(), 1, other)
+            bounded_again(condition, domain(), 1, torch.inf, other)
 
 
 @pytest.mark.gate

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import Control, PerState, State, Time
+from lyapnet.base.types import Control, Corners, PerState, State, Time
 from lyapnet.claims.contraction import Contraction
 from lyapnet.claims.kept_regions import REMEDY
 from lyapnet.claims.preconditions import append_constants, over_time
@@ -66,23 +66,25 @@ class RecedingDecrease(DecreaseCondition):
         budget: Budget,
         proposed: float | None = None,
     ) -> None:
-        """Exclude {x ∈ B: V < c} from the condition, where c ≤ level is below V on the boundary of B.
+        """Exclude the hole {x ∈ B: V < c} from the condition, where c ≤ level is below V around it.
 
         Args:
             states: D, extended by the bounds of the constants.
             proposed: the only c to test; None to choose the largest.
         """
-        rim = minimum(
-            self.V, *faces(*over_time(append_constants(around.box, states), 0.0), [1 + i for i in seen]), budget
-        )
-        self._choose_hole(around, level, rim, proposed)
-        self.constraints = OutsideTheHole(self.V, around.box, self.hole)
-
-    def _choose_hole(self, around: Contraction, level: float, rim: float, proposed: float | None) -> None:
-        """Choose c below `rim`, a lower bound of V around the hole."""
+        rim = minimum(self.V, *self._around_hole(append_constants(around.box, states), states, seen), budget)
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
         if proposed is not None and not self.hole < rim:
             raise UsageError(f"Expected V > c = {self.hole!r} around the hole, got V ≥ {rim:g}; {REMEDY}.")
+        self.constraints = self._hole_of(around.box)
+
+    def _around_hole(self, inner: Box, states: Box, seen: Sequence[int]) -> tuple[Corners, Corners]:
+        """Boxes of (0, x) on which V > c is needed: the boundary of B, of which `inner` is the box with constants."""
+        return faces(*over_time(inner, 0.0), [1 + i for i in seen])
+
+    def _hole_of(self, box: Box) -> Constraints:
+        """h > 0 where V need not fall, for the hole in a box B."""
+        return OutsideTheHole(self.V, box, self.hole)
 
     def open_everywhere(self, level: float) -> None:
         """Exclude {x ∈ D: V < c} from the condition, where disturbances or a held control may increase V."""

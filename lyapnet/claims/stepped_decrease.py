@@ -8,12 +8,11 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import Control, Corner, PerState, Points, State, Time
-from lyapnet.claims.contraction import Contraction
-from lyapnet.claims.preconditions import append_constants, over_time
+from lyapnet.base.types import Control, Corner, Corners, PerState, Points, State, Time
+from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import RecedingDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.branch_and_bound import Budget, just_below, minimum
+from lyapnet.prover.branch_and_bound import just_below
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.horizon import Horizon
@@ -110,22 +109,13 @@ class SteppedDecrease(Stepped, RecedingDecrease):
             raise UsageError(f"Expected decay < 1/Δt = {1 / dt:g}, got {decay}; V cannot fall by more than itself.")
         self.problem, self.sides = problem, []
 
-    def open_hole(
-        self,
-        around: Contraction,
-        states: Box,
-        seen: Sequence[int],
-        level: float,
-        budget: Budget,
-        proposed: float | None = None,
-    ) -> None:
-        """Choose c ≤ level below V on D without B, so that {x ∈ D: V < c} ⊂ B; steps may lead there without more.
+    def _around_hole(self, inner: Box, states: Box, seen: Sequence[int]) -> tuple[Corners, Corners]:
+        """Boxes that cover D without B: a step may jump over the boundary of B, so that V > c there is not enough."""
+        return _outside(inner, states, seen)
 
-        A step may jump over the boundary of B, so that V > c there is not enough.
-        """
-        whole = append_constants(around.box, states)
-        self._choose_hole(around, level, minimum(self.V, *_outside(whole, states, seen), budget), proposed)
-        self.constraints = IntoTheHole(self)
+    def _hole_of(self, box: Box) -> Constraints:
+        """h > 0 where the next step leads into the hole."""
+        return IntoTheHole(self)
 
     def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
         t, after = torch.zeros_like(t), self.after(x, u)
@@ -156,7 +146,7 @@ def steps_of(horizon: Horizon) -> dict[str, Any]:
     return {"dt": horizon.dt, "method": horizon.method}
 
 
-def _outside(inner: Box, states: Box, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _outside(inner: Box, states: Box, axes: Sequence[int]) -> tuple[Corners, Corners]:
     """Boxes of (0, x) that cover D without the interior of a box in it."""
     lower: list[Corner] = []
     upper: list[Corner] = []

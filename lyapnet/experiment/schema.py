@@ -267,8 +267,9 @@ def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
 
 
 def _same_name_elsewhere(key: str, schema: type) -> list[str]:
-    """The full names of fields with this name, for a key in the wrong section."""
-    return [name for name in _annotations(schema) if name.split(".")[-1] == key]
+    """The full names of fields with this name, for a key in the wrong section; those of every task come first."""
+    names = [name for name in _annotations(schema) if name.split(".")[-1] == key]
+    return sorted(names, key=lambda name: not name.startswith(("system.", "cost.", "initial_states.", "horizon.")))
 
 
 def _explain(error: OmegaConfBaseException, schema: type) -> str:

@@ -138,7 +138,7 @@ def test_the_warning_goes_with_the_closed_loops(tmp_path):
 def test_the_warning_says_where_a_proved_funnel_holds(tmp_path):
     controller = controller_of("double_integrator")
     states = Box(torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]))
-    funnel = KeptSide(0.1, 0.0, states, None, None, degree=2, rho=1e9, seconds=1.0)
+    funnel = KeptSide(0.1, 0.0, states, None, None, steps=False, degree=2, rho=1e9, seconds=1.0)
     page = page_of(controller, "double integrator", funnel)
     says = 'await click(1.5, 0.1); told.push(element("outside").textContent.includes("only the proved funnel"));'
     assert shown(page, tmp_path, says)[0] == "true"

@@ -152,6 +152,7 @@ def largest_condition(found, system, cost=None, V=None):
         return float((V_t + rate + found.alpha * cost.running(x, u) - found.delta).max())
 
 
+@pytest.mark.gate
 def test_what_nothing_is_added_to_is_certified():
     """The twin of all that follows."""
     found = claim(**patient())
@@ -328,6 +329,7 @@ def lambda_free(x):
     return 0.01 * torch.relu(x[..., 0] - 0.9)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "honest",
     sample(
@@ -429,6 +431,7 @@ def test_all_that_torch_does_is_bounded(way):
     assert outcome(System(TORCH[way])) != "certified"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("way", sample(["spike", "spike by sign", "minus zero"], 3))
 def test_a_spike_outside_the_funnel_does_no_harm(way):
     """The twin: where V exceeds its level on X₀ nothing is claimed."""
@@ -626,6 +629,7 @@ class Own(Stale):
         return Linear.f(self, x) - 0.1 * torch.relu(x[..., :1] - 0.6)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "parts",
     sample(
@@ -690,6 +694,7 @@ def test_no_such_value_function_is_certified(name):
     assert outcome(V=VALUES[name]) != "certified"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "add",
     sample(
@@ -827,6 +832,7 @@ def test_a_budget_that_does_no_work_is_refused(wrong):
         Budget(AMPLE, **wrong)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "numbers", [{"alpha": 1e-9}, {"alpha": 1, "V": Bowl(lambda t, x: 0.4 * x[..., 0] ** 2 + 0 * t)}]
 )

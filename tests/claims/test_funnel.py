@@ -56,6 +56,7 @@ def test_the_riccati_solution_is_certified(P):
     assert claim.wanted == pytest.approx(float(stationary(P)(torch.zeros(()), corners).max()), rel=2e-3)
 
 
+@pytest.mark.gate
 def test_closed_loops_stay_in_the_funnel_and_below_their_guaranteed_cost(P):
     """An independent integrator starts on the boundary of the funnel."""
     claim, V = riccati_claim(), stationary(P)
@@ -85,6 +86,7 @@ def test_a_wrong_value_function_is_falsified(P, factor):
     assert found.condition > 0
 
 
+@pytest.mark.gate
 def test_an_unstable_loop_is_falsified():
     system = Linear([[0.0, 1.0], [4.0, 0.0]], [[0.0], [1.0]])
     claim = certify(loop(1e-2 * torch.eye(2), system), budget=Budget(AMPLE, boxes=1000))
@@ -145,6 +147,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
     assert proof_without_search(monkeypatch, P).verdict == "certified"
 
 
+@pytest.mark.gate
 def test_a_violation_lowers_the_level_and_what_lies_below_holds(P):
     condition = Planted(loop(P), 0.9, 0.05).plant(torch.tensor([1.0, 0.5, 0.2]), 0.2, 0.3)
     proof = prove(condition, domain(), 12.0, Budget(AMPLE, boxes=10_000), stop_at_counterexample=False)
@@ -171,6 +174,7 @@ def test_a_spent_budget_leaves_it_unknown(P):
     assert len(proof.undecided) > 0
 
 
+@pytest.mark.gate
 def test_a_small_frontier_gives_up_the_highest_boxes(P):
     condition = true_with_a_dip(P)
     kept = prove(condition, domain(), budget=Budget(AMPLE))
@@ -236,6 +240,7 @@ def test_the_enclosing_box_reaches_around_the_level_set(P):
     assert (box.upper < 1.3 * torch.maximum(extent, X0().upper)).all()
 
 
+@pytest.mark.gate
 def test_a_tiny_budget_proves_nothing_and_falsifies_nothing(P, monkeypatch):
     monkeypatch.setattr(funnels, "LEAST", AMPLE)  # seconds for levels, enough on a busy machine too
     claim = certify(loop(P), budget=Budget(1e-6))

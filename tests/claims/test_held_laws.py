@@ -57,6 +57,7 @@ def proved(readings, delta=1e-3, boxes=20_000, alpha=ALPHA):
     )  # fmt: skip
 
 
+@pytest.mark.gate
 def test_up_to_the_longest_hold_in_closed_form_it_is_certified():
     assert longest_hold() == pytest.approx(0.7321, abs=1e-4)
     claim = proved(held(0.97 * longest_hold()))
@@ -139,6 +140,7 @@ def test_constraints_need_a_law_that_is_read_at_every_t():
         certify(made, Funnel(delay=0.1))
 
 
+@pytest.mark.gate
 def test_limits_that_follow_the_state_need_a_law_that_is_read_at_every_t():
     class Falling(VaryingLimits):
         def limits_at(self, x):
@@ -211,6 +213,7 @@ def test_loops_with_jitter_delay_errors_and_pushes_stay_in_the_funnel():
     assert (cost + about.cost.terminal(x) <= guaranteed).all()
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("delay", "error", "width"), sample([(0.0, 0.0, 0.02), (0.0, 0.02, 0.3), (0.03, 0.0, 0.3), (0.03, 0.02, 0.02)], 3)
 )
@@ -302,6 +305,7 @@ def test_a_held_law_keeps_its_region_and_enters_the_ultimate_set():
     assert claim.extent.contains(x).all()
 
 
+@pytest.mark.gate
 def test_where_the_held_law_is_unstable_no_region_is_claimed():
     """With u = −Kx held for Δt the eigenvalues of the sampled system leave the unit circle at some Δt."""
     A, B = torch.tensor([[0.0, 1.0], [0.0, 0.0]]), torch.tensor([[0.0], [1.0]])

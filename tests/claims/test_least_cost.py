@@ -56,6 +56,7 @@ def optimum(x):
     return stationary(riccati())(torch.zeros(()), x)
 
 
+@pytest.mark.gate
 def test_the_riccati_solution_bounds_the_optimum_from_below_and_closely():
     claim = plain_claim()
     assert claim.verdict == "certified"
@@ -265,12 +266,14 @@ def test_where_nothing_is_proved_from_below_the_figure_is_drawn_all_the_same():
         two_sided(value, value + 0.1, least, value, "unknown").savefig(io.BytesIO(), format="png")
 
 
+@pytest.mark.gate
 def test_a_small_set_speaks_of_the_controls_that_stay_in_it():
     claim = claimed(states=Box([-1.1, -0.8], [1.1, 0.8]).double())
     assert claim.verdict == "certified"
     assert not claim.everywhere
 
 
+@pytest.mark.gate
 def test_about_a_target():
     """The same task moved to (2, 0): the same bound."""
     target = torch.tensor([2.0, 0.0])
@@ -286,6 +289,7 @@ def test_about_a_target():
     assert claim.level == pytest.approx(plain_claim().level, rel=1e-2)
 
 
+@pytest.mark.gate
 def test_where_nothing_is_proved_nothing_is_said():
     claim = claimed(boxes=0)
     assert claim.verdict == "unknown"

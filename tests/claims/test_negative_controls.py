@@ -116,6 +116,7 @@ def test_a_hundred_planted_violations_are_never_certified(first):
     assert "certified" not in controls(range(first, first + 4))
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("seed", sample(range(2), 2))
 def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
     """Their states grow, and V grows from the counterexample along a short step, in plain arithmetic."""
@@ -132,6 +133,7 @@ def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
     assert violation == pytest.approx(found.counterexample.condition, rel=1e-4)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("V", [Bowl(-2.0), Bowl(0.05)], ids=["wrong sign", "too small"])
 def test_a_wrong_value_function_is_falsified(V, monkeypatch):
     monkeypatch.setattr(funnel, "LEVELS", 0.5)
@@ -194,6 +196,7 @@ def test_kinks_are_certified():
     assert found.verdict == "certified"
 
 
+@pytest.mark.gate
 def test_a_law_with_branches_is_certified_off_the_goal():
     """At the goal itself the gain of Sontag's law is 0/0, and has no bound."""
     condition = DecreaseCondition(loop(Bowl(), law=SontagPolicy), 0.5, 0.05)

@@ -133,6 +133,7 @@ def test_the_condition_vanishes_for_the_closed_form():
     assert (mean < 0).all()
 
 
+@pytest.mark.gate
 def test_the_closed_form_is_certified():
     claim = certified()
     assert claim.verdict == "certified"
@@ -296,6 +297,7 @@ def test_a_set_that_is_too_small_is_not_certified():
     assert prove(probability=1 - 1e-9, states=Box([-1.6, -3.0], [1.6, 3.0])).verdict == "unknown"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", sample(["V a tenth too low", "noise that V does not pay for", "σ doubled"], 3))
 def test_with_a_larger_leak_the_same_is_true(name):
     """The twins: what fails holds with a δ that pays for it, or an α that asks for less."""
@@ -323,6 +325,7 @@ def test_constraints_hold_in_the_funnel():
     assert claim.rho < claim.rim < float(value()(torch.zeros(()), torch.tensor([1.2, 0.0])))
 
 
+@pytest.mark.gate
 def test_the_end_is_where_paths_end():
     claim = certified()
     left, _ = paths(task(), value(), torch.zeros(500, 2))(claim.rho, claim.delta)

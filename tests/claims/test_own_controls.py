@@ -152,6 +152,7 @@ class OfOne(Limits):
         return super().minimise(R, b) * (1 + self.leave(b))
 
 
+@pytest.mark.gate
 def test_certificates_look_at_it():
     with pytest.raises(UsageError, match=r"Expected OfOne\.minimise\(R, b\) in the set that contains\(u\) describes"):
         claim(controls=OfOne(lambda b: 1e4 * torch.relu(1e-4 - (b - 1.93).abs())))

@@ -127,6 +127,7 @@ def springs():
 # Closed forms
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("share", [0.999, 1.001])
 def test_of_one_state_the_largest_interval_is_known(share):
     """V̇ = 2(−1 − 2 gain)x² ≤ −λx² where gain ≥ λ/4 − ½. A law that depends on the gain has no such limit."""
@@ -157,6 +158,7 @@ def test_of_two_states_the_largest_interval_is_that_of_the_matrix_inequality():
     assert claimed(spring(), {"mass": [1.0, 1.01 * mass]}).rho == -math.inf
 
 
+@pytest.mark.gate
 def test_where_the_equilibrium_moves_it_says_how_far():
     """ẋ = drift − (decay + 2)x rests at drift/(decay + 2), for each plant; V = x² falls beyond |x| = 0.2/(3 − λ/2)."""
     claim = claimed(leaky(), {"drift": [-0.1, 0.2]})
@@ -238,6 +240,7 @@ def test_the_law_and_V_are_told_x_alone():
     assert (about.system.gain, about.system.decay) == (1.0, 1.0), "the comparison does not change the plant"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("system", sample([Bumpy, BumpyFarOut], 2))
 def test_what_fails_in_a_thin_slice_of_plants_is_found(system):
     """In the slice nothing contracts at the goal, and V rises far from it. Without the slice there is a region."""

@@ -88,6 +88,7 @@ def start(claim):
 # Closed forms
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("w", [1e-3, 0.1, 0.9])
 def test_of_one_state_the_ultimate_bound_is_known(w):
     """ẋ = −x + w(t) with V = x²: V̇ ≤ −λV where |x| ≥ 2W/(2 − λ)."""
@@ -159,7 +160,8 @@ def test_a_hundred_times_larger_pushes_leave_it_and_nothing_is_proved_of_them():
 @pytest.mark.gate
 def test_nothing_is_proved_of_a_hole_that_is_too_small(monkeypatch):
     """The counterpart of the search for c: a wrong c proves nothing."""
-    monkeypatch.setattr(region, "ultimate_level", lambda *_: 0.5 * pushed_claim().hole)
+    hole = 0.5 * pushed_claim().hole
+    monkeypatch.setattr(region, "ultimate_level", lambda *_: hole)
     claim = claimed(disturbance=W)
     assert claim.rho == -math.inf
     assert claim.verdict != "certified"
@@ -204,6 +206,7 @@ def test_what_is_no_disturbance_is_refused(w):
         claimed(disturbance=torch.tensor(w))
 
 
+@pytest.mark.gate
 def test_the_certificate_claims_no_more_than_practical_stability():
     claim = pushed_claim()
     certificate = RegionCertificate(Controller(problem(), stationary(riccati())), claim, {"seed": 0})

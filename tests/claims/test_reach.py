@@ -100,6 +100,7 @@ def scalar(share, edge=EDGE, **options):
     )  # fmt: skip
 
 
+@pytest.mark.gate
 def test_the_closed_form_is_certified_and_its_bound_is_above_the_exact_probability():
     claim = scalar(0.97)
     assert claim.verdict == "certified"
@@ -118,6 +119,7 @@ def test_the_closed_form_is_certified_and_its_bound_is_above_the_exact_probabili
     assert float(claim.mean_time(torch.tensor(GAIN))) > math.log(1 / EDGE) / GAIN
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("options", [{"share": 1.03}, {"share": 0.97, "edge": 0.97 * EDGE}])
 def test_a_little_more_than_the_closed_form_is_falsified(options):
     claim = scalar(**options)
@@ -153,6 +155,7 @@ def paths(problem, V, x0, target, steps=4000, dt=0.002, seed=0, gain=1.0):
     return highest, reached
 
 
+@pytest.mark.gate
 def test_simulated_paths_keep_both_bounds():
     claim, V, count = certified(), value(), 1000
     corner = max(X0().corners(), key=lambda x: float(V(NOW, x)))
@@ -318,6 +321,7 @@ def noiseless():
     return Controller(problem, value(), policy=HJBPolicy)
 
 
+@pytest.mark.gate
 def test_a_controller_is_certified_from_python():
     certificate = lyapnet.certify(noiseless(), claim_of(noise={"x2": 0.3}), budget=AMPLE)
     assert certificate.verdict == "certified"
@@ -337,6 +341,7 @@ def test_the_noise_of_the_claim_is_not_rounded():
     assert float(loop.noise.sigma[1, 0]) == 0.3
 
 
+@pytest.mark.gate
 def test_a_rate_that_is_asked_for_is_kept_where_no_sample_says_what_is_possible():
     assert prove(target=box([-3.0, -6.0], [3.0, 6.0]), avoided=(), rate=0.5, boxes=10).rate == 0.5
 
@@ -364,6 +369,7 @@ def test_a_forged_proof_is_refused(kept, tmp_path, name):
     assert check(controller, other)["verdict"] == "refused"
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_checked(kept):
     path, controller = kept
     again = check(controller, path)

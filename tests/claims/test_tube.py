@@ -80,6 +80,7 @@ def final(about, x0):
     return y[:-1], y[-1] + float((y[:-1] ** 2).sum())
 
 
+@pytest.mark.gate
 def test_a_linear_flow_and_its_cost_in_closed_form(straight):
     """x(T) = e^{AT}x₀, and J = x₀ᵀPx₀ by a Lyapunov equation: the bounds contain them, and are tight."""
     A = torch.tensor([[0.0, 2.0], [-2.0, -0.5]]).double()
@@ -234,6 +235,7 @@ def test_without_the_bounds_they_would_be(monkeypatch):
     assert outside(prove_tube(about, Budget(20)), about)[0] > 0
 
 
+@pytest.mark.gate
 def test_the_certificate_and_its_figure(swung):
     certificate = TubeCertificate(controller(Swinging(), Formula(damped)), swung, {"seconds": 30.0, "seed": 0})
     assert certificate.result["verdict"] == "certified"

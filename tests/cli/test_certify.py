@@ -37,6 +37,7 @@ def certificate(capsys, *arguments):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.gate
 def test_sampled_and_statistical(checkpoint, capsys):
     sampled = certificate(capsys, "sampled", checkpoint)
     assert sampled["kind"] == "sampled"

@@ -52,6 +52,7 @@ def test_the_config_goes_on_with_values_and_ranges(folder, capsys):
     assert (folder / "pendulum_identified.png").stat().st_size > 10_000
 
 
+@pytest.mark.gate
 def test_one_object_with_everything(folder, capsys):
     arguments = ["identify", "pendulum.yaml", "one.csv", "--test", "two.csv", "--json", "--out", "found.yaml"]
     assert main([*arguments, "--parameters", "mass,length", "--parameters", "damping,gravity", "--family"]) == 0
@@ -69,6 +70,7 @@ def test_one_object_with_everything(folder, capsys):
     assert "randomise" not in content
 
 
+@pytest.mark.gate
 def test_ranges_that_a_config_cannot_have_are_left_out_and_told(folder, capsys):
     (folder / "pendulum.yaml").write_text(f"{TASK}noise: {{velocity: 0.1}}\n")
     assert main(["identify", "pendulum.yaml", "one.csv"]) == 0

@@ -59,6 +59,7 @@ def controller(path):
     return lyapnet.load(path)
 
 
+@pytest.mark.gate
 def test_public_attributes(controller):
     assert isinstance(controller.system, DoubleIntegrator)
     assert isinstance(controller.cost, lyapnet.QuadraticCost)
@@ -392,6 +393,7 @@ def test_another_plant_is_noted_at_load(path, caplog):
     assert "other g, R;" in note
 
 
+@pytest.mark.gate
 def test_evaluate_notes_another_plant_once_and_measures_it(path, tmp_path, monkeypatch, capsys, caplog):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])

@@ -72,6 +72,7 @@ def test_a_controller_of_the_zoo_shows_what_it_is(name):
     assert not {"script", "img", "link", "iframe"} & {*page.found}
 
 
+@pytest.mark.gate
 def test_the_table_has_names_units_limits_and_the_record():
     controller = lyapnet.load("zoo:pendulum_limited")
     text = page_of(controller).text
@@ -91,6 +92,7 @@ class Hostile(DoubleIntegrator):
         self.control_names = ("<b>u</b>",)
 
 
+@pytest.mark.gate
 def test_text_of_users_is_escaped(tmp_path, monkeypatch):
     limits = StateLimits([0], [2.0], [1.0], [1.0], ["<i>position</i>"])
     problem = problem_of(Hostile())
@@ -131,6 +133,7 @@ def test_numbers_are_those_on_record_beside_the_best_checkpoint(tmp_path):
     assert "measured" not in page_of(lyapnet.load(folder / "best.ckpt")).text
 
 
+@pytest.mark.gate
 def test_the_command_for_a_page_names_own_classes_that_it_can_import(monkeypatch):
     controller = lyapnet.load("zoo:double_integrator")
     for name, there in (("my_module:Cart", True), ("__main__:Cart", False)):
@@ -161,6 +164,7 @@ def test_odd_tasks_are_shown(name):
     assert drawn(page) or "There is no drawing of closed loops" in page.text
 
 
+@pytest.mark.gate
 def test_a_member_another_law_after_the_horizon_float32_and_an_estimator_are_shown():
     family = lyapnet.load("zoo:cartpole_family")
     assert drawn(page_of(family.with_(pole_mass=0.9, length=1.1)))

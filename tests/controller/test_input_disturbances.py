@@ -85,6 +85,7 @@ def test_the_estimate_is_that_of_a_kalman_filter_written_in_numpy():
         assert u == pytest.approx(float(expected.detach()), rel=1e-6, abs=1e-7)
 
 
+@pytest.mark.gate
 def test_nothing_winds_up_at_a_limit():
     """A disturbance beyond what the control can take is known all the same, as the prediction knows the limits."""
     controller = controller_of(**ESTIMATED, controls={"lower": -1, "upper": 1})

@@ -110,6 +110,7 @@ def slopes(oracle, x0, u, h=1e-4, directions=3):
     return (up - down) / (2 * h), (up - 2 * middle + down) / h**2
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("name", "least", "most"), sample([("reacher", 1, 60), ("cartpole_swingup", 170, 200)], 2))
 def test_optimum_is_a_minimum_of_the_rollouts_cost(name, least, most):
     oracle, X0 = transcription_of(name)

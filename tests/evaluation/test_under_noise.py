@@ -159,6 +159,7 @@ def test_with_risk_costs_are_certainty_equivalents_those_of_the_oracle():
     assert worse.dearest_mean > noise.dearest_mean
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("shift", [0.0, -0.3])
 def test_a_risk_that_no_path_shows_is_not_measured(shift):
     """Where θ times the spread of J is large, paths tell nothing but V itself, which may be wrong."""
@@ -193,6 +194,7 @@ def test_the_dearest_paths_count_in_part():
     assert_close(_mean_of_dearest(J.flip(0)), torch.tensor([1.0, 2.0]) * (29 + 0.5 * 28) / 1.5)
 
 
+@pytest.mark.gate
 def test_the_summary_names_the_risk():
     result = lyapnet.evaluate(controller_of(task(risk=0.5)), samples=32, paths=16)
     printed = evaluation_table("title", result)

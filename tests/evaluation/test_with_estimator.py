@@ -121,6 +121,7 @@ def test_loops_that_are_lost_are_told():
     assert "not finite" in [*evaluation_table("x", result).columns[1].cells]
 
 
+@pytest.mark.gate
 def test_an_evaluation_has_the_rows_where_outputs_are_measured():
     result = lyapnet.evaluate(controller_of(), 16, optimum=False)
     assert result["outputs"]["estimator"] == "ekf"
@@ -131,6 +132,7 @@ def test_an_evaluation_has_the_rows_where_outputs_are_measured():
     assert "outputs" not in lyapnet.evaluate(controller_of(outputs={}), 16, optimum=False)
 
 
+@pytest.mark.gate
 def test_random_plants_are_estimated_in_an_evaluation():
     controller = controller_of(randomise={"length": [0.8, 1.2]})
     result = lyapnet.evaluate(controller, 16, optimum=False)["outputs"]

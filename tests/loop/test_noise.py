@@ -121,6 +121,7 @@ def test_the_same_seed_draws_the_same_noise_with_variance_dt():
     assert abs(float(drawn(task, x0).var()) / DT - 1) < 0.02
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("constant", [True, False])
 def test_for_the_value_function_every_path_has_residual_zero(constant):
     task = problem(constant)
@@ -268,6 +269,7 @@ class Coupled(Linear):
         return torch.diag_embed(0.3 + 0.1 * x)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("constant", [True, False])
 @pytest.mark.parametrize("wrong", sample([0.0, 0.05], 2))
 def test_many_sources_leave_no_residual_of_the_value_function_either(constant, wrong):
@@ -372,6 +374,7 @@ def test_the_certainty_equivalent_has_the_derivatives_of_its_integral():
         assert_close(one, other, rtol=0.02, atol=0.02)
 
 
+@pytest.mark.gate
 def test_exponentials_of_surprises_have_mean_one_with_risk_and_not_without():
     task = problem().replaced(risk=0.8)
     V = value_of(task)

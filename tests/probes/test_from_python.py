@@ -43,6 +43,7 @@ def trained(problem, tmp_path_factory):
     return trainer, module, own, callback
 
 
+@pytest.mark.gate
 def test_curves_reach_any_logger(trained):
     _, _, logger, _ = trained
     assert [step for step, _ in logger.metrics["loss/train"]] == list(range(1, EPOCHS * STEPS + 1))
@@ -81,6 +82,7 @@ def test_lightnings_own_checkpoint_is_read_again(trained, problem):
     assert not torch.equal(Network()(torch.tensor(0.2), x), module.V(torch.tensor(0.2), x))
 
 
+@pytest.mark.gate
 def test_loaders_serve_as_well_as_a_data_module(problem):
     module = lyapnet.ValueModule(problem, Network(), lyapnet.ValueProgram(trajectory_cost=1))
     states = DataLoader([problem.initial_states.sample(4)] * 2, batch_size=None)

@@ -39,6 +39,7 @@ def test_callback_runs_and_is_resumed(tmp_path):
     assert costs(again)[-1] > 0
 
 
+@pytest.mark.gate
 def test_another_logger_gets_curves_figures_and_config(tmp_path, monkeypatch):
     made = []
 

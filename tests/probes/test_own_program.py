@@ -28,6 +28,7 @@ def run(tmp_path_factory):
     return lyapnet.train(CONFIG, [f"logs={tmp_path_factory.mktemp('own_program')}"])
 
 
+@pytest.mark.gate
 def test_it_trains_and_its_terms_are_logged(run):
     header = (run.folder / "metrics.csv").read_text().splitlines()[0].split(",")
     assert {"term/constraint", "term/terminal", "term/trajectory_cost", "term/pointwise"} <= set(header)

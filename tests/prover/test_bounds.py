@@ -262,6 +262,7 @@ CONDITIONS = [
 ]  # fmt: skip
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("system", "network", "options"), sample(CONDITIONS, 3))
 def test_whole_conditions_lie_within_bounds(system, network, options):
     c, n = condition(system, network, **options)

@@ -81,6 +81,7 @@ def test_the_true_gradient_is_certified():
     assert claim(Formula(lambda t, x: quadratic(x) + 0.01 * torch.relu(x[..., 0]) + 0 * t)).verdict == "certified"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", ["double_integrator", "cartpole_balancing_certified", "reacher"])
 def test_networks_of_the_package_know_their_gradients(name):
     controller = untrained(name)

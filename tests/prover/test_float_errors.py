@@ -87,6 +87,7 @@ def test_no_program_in_float32_is_beyond_the_bound_which_is_not_a_hundred_times_
         assert found <= largest <= 100 * found
 
 
+@pytest.mark.gate
 def test_bounds_for_float64_are_refuted_by_float32():
     assert seen(network)[0] > bound(network, torch.float64)[0] > 0
 
@@ -109,6 +110,7 @@ def test_a_sum_may_fuse_a_product_that_another_one_has_rounded():
     assert largest >= 5 * UNIT
 
 
+@pytest.mark.gate
 def test_a_jump_counts_where_it_may_flip_and_a_choice_between_equals_does_not():
     assert bound(lambda t, x: torch.where(x[:1] > 0.3, 1.0, 0.0))[0] >= 1
     assert bound(lambda t, x: (x[:1] > 0.3).double())[0] >= 1
@@ -121,6 +123,7 @@ def test_numbers_that_leave_float32_have_no_bound():
     assert bound(lambda t, x: torch.exp(100 * x[:1]) * 1e-30, torch.float64, boxes=5000)[0] < math.inf
 
 
+@pytest.mark.gate
 def test_a_branch_that_is_not_taken_may_overflow():
     """Softplus is where(x > 20, x, log1p(exp(x))), and exp(100) is beyond float32."""
     line = (-1.0, 0.2), (1.0, 0.2)
@@ -133,6 +136,7 @@ def test_operations_whose_errors_are_not_known_are_refused_by_name():
         bound(lambda t, x: torch.round(x[:1]))
 
 
+@pytest.mark.gate
 def test_what_is_found_is_rounded_upwards_to_two_digits():
     law = law_of(network)
     sides = torch.tensor([-1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double()

@@ -65,6 +65,7 @@ def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     )  # fmt: skip
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("condition", "wanted"), sample([(dipped, 2.0), (violated, 6.0)], 2))
 def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):
     condition, path = condition(P), tmp_path / "proof.pt"
@@ -287,6 +288,7 @@ def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
     assert (again.verdict, again.level) == ("falsified", pytest.approx(whole.level, rel=0.05))
 
 
+@pytest.mark.gate
 def test_a_file_that_says_finished_is_bounded_again(P, kept):
     """All waiting leaves are listed as closed, as if the proof were finished."""
     rewritten(kept, called_closed)
@@ -299,6 +301,7 @@ def test_a_file_that_says_finished_is_bounded_again(P, kept):
 # Checking without a search
 
 
+@pytest.mark.gate
 def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
     """With K cuts, the search bounds 2K + 1 boxes, and the check bounds the K + 1 leaves."""
     content = read(finished)

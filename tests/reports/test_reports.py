@@ -67,6 +67,7 @@ def solved(name):
     return problem, optima.u.transpose(0, 1)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", sample(TOLERANCE, 6))
 def test_optima_are_right(name):
     problem, u = solved(name)

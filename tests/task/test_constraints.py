@@ -137,6 +137,7 @@ def test_the_penalty():
     assert problem_of(constrained()).relaxed().constraints is None
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("limit", [0.25, 1 / 6, 0.1])
 def test_the_oracle_finds_the_closed_form_of_bryson_and_denham(limit):
     """J* = 2, 2 + 6(1 − 4a)² and 4/(9a), of the continuous task with fixed end."""

@@ -116,6 +116,7 @@ PLAIN = {
 }  # fmt: skip
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_an_exported_law_stays_within_it(dtype, tmp_path):
     own = Controller(build_problem(config_from_plain(PLAIN)), Bowl(), policy=SampledPolicy)

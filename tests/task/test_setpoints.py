@@ -89,6 +89,7 @@ def test_targets_that_one_control_holds_are_exact():
     assert isinstance(family_cost_of(task.cost).targets, LinearTargets)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("base", [HELD_AT_ANGLES, TANKS], ids=["pendulum", "tanks"])
 def test_a_member_is_the_task_that_is_built_alone(base):
     config = config_from_plain({**base, "training": {"precision": "float64"}})
@@ -125,6 +126,7 @@ def test_other_states_are_0_where_that_is_held_and_those_that_are_written_stay()
     assert_close(family_cost_of(task.cost).target(torch.tensor([0.4])), expected, atol=1e-9, rtol=0)
 
 
+@pytest.mark.gate
 def test_the_regulator_of_each_member_counts_u_from_its_own():
     task = problem(TANKS)
     regulator, z = Regulator(task), torch.tensor([[1.44 * 0.3, 0.3, 0.3], [1.44 * 0.55, 0.55, 0.55]])

@@ -75,6 +75,7 @@ def both(request):
     return about, moved, x, u
 
 
+@pytest.mark.gate
 def test_optima_are_the_same(both):
     about, moved, x, u = both
     x0 = about.initial_states.sample(6, torch.Generator().manual_seed(0))

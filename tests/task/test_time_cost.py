@@ -83,6 +83,7 @@ def test_optima_take_the_least_time(monkeypatch):
     assert excess().max() > 0.05  # the twin: without wider ends of time first some are late
 
 
+@pytest.mark.gate
 def test_its_widening_is_over_when_an_optimum_is_found():
     problem = problem_of(horizon={"steps": 40, "dt": 0.1})
     x0 = problem.initial_states.center[None].double() + 1

@@ -66,6 +66,7 @@ def same(one, other):
     return all(torch.equal(one[name], other[name]) for name in other)
 
 
+@pytest.mark.gate
 def test_after_a_while_it_returns_to_its_best_weights(config, capsys, monkeypatch):
     seen = Validations(monkeypatch, [3, 2, 2.1, 2.1, 2.1, 1.9, 1.9])  # worse at 4, 6 and 8: for 4 steps
     run, out = run_of(config, capsys)
@@ -82,6 +83,7 @@ def test_after_a_while_it_returns_to_its_best_weights(config, capsys, monkeypatc
     assert 0 < near < far / 2
 
 
+@pytest.mark.gate
 def test_it_ends_with_its_best_weights(config, capsys, monkeypatch):
     seen = Validations(monkeypatch, [3, 3, 3, 3, 2, 2, 2 * (1 + 1.01 * WORSE_BY)])
     run, out = run_of(config, capsys)
@@ -128,6 +130,7 @@ def test_a_divergence_sends_it_back_at_once(least_gain, config, capsys, monkeypa
     assert entry["to"] in (0, 4)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("noise", [{}, {"velocity": 0.5}], ids=["without noise", "under noise"])
 def test_without_a_goal_a_rise_within_the_spread_is_none(noise, config, capsys, monkeypatch):
     """From one initial state, where V(0, x₀) has no spread."""

@@ -71,6 +71,7 @@ def train(tmp_path, capsys, *overrides, resume=()):
     return json.loads(record.read_text())["compiled"], lines
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("overrides", "compiled"),
     sample(

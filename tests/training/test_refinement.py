@@ -148,6 +148,7 @@ def test_its_points_fail_the_condition_or_are_undecided(run):
     assert len(refinement.failing_points(claimed(best(run), level=-1.0))) == 2, "no violation lies below this level"
 
 
+@pytest.mark.gate
 def test_what_is_pushed_is_refined_against_the_push(run):
     """The condition that is sought is the claim's own: V̇ at its worst under |w| ≤ w_max."""
     still = claimed(best(run))
@@ -209,6 +210,7 @@ def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
     assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).complete
 
 
+@pytest.mark.gate
 def test_the_same_command_does_not_train_again(run, monkeypatch):
     checkpoint, _ = refine(run)
     before = checkpoint.read_bytes()
@@ -265,6 +267,7 @@ def test_what_is_certified_needs_no_round(run, monkeypatch):
     assert not list(run.glob("refine_*"))
 
 
+@pytest.mark.gate
 def test_where_nothing_fails_it_still_trains(run):
     """A rim that is too low, say, has neither counterexamples nor undecided boxes."""
     refine(run, certified=partial(claimed, undecided=(), level=-1.0))
@@ -359,6 +362,7 @@ def test_refining_imports_nothing_that_a_checkpoint_names(what, run, own, undeci
     assert not own("trap")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("what", TRAPS)
 def test_refining_trains_with_what_the_command_names(what, run, own, undecided, capsys):
     rewrite(best(run), **TRAPS[what])

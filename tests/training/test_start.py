@@ -137,6 +137,7 @@ def test_within_limits_optima_are_a_start_too(swing, tmp_path, capsys):
     assert float(unlimited.rollout(torch.tensor([[math.pi, 0.2]])).u.detach().abs().max()) > 9
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("task", sample([LINEAR, SWING], 2))
 def test_an_X0_of_one_point(task):
     point = {"lower": task["initial_states"]["lower"], "upper": task["initial_states"]["lower"]}
@@ -333,6 +334,7 @@ def test_under_noise_V_starts_with_the_mean_of_the_costs_to_go(measured, monkeyp
     assert (missed.mean(1).abs().max() < 0.015 * path.cost.mean()) == measured
 
 
+@pytest.mark.gate
 def test_a_measured_level_changes_nothing_where_V_is_the_cost_to_go(monkeypatch):
     rises = []
     monkeypatch.setattr(ExpansionNetwork, "raise_by", lambda self, t, rise: rises.append(rise))

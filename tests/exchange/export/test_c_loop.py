@@ -121,6 +121,7 @@ def compiled_loop(loop, folder, dtype="float64", name="lyapnet"):
     return CompiledLoop(LoopTraces(loop), library_of([folder / "policy.c"], c.FLAGS), style)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", sample(LOOPS, 9))
 def test_it_is_pythons_over_ten_thousand_steps(kind, tmp_path):
     loop = LOOPS[kind]()
@@ -334,6 +335,7 @@ def test_a_plant_in_c_is_led_as_in_python(tmp_path):
     assert [float(each) for each in printed] == pytest.approx(x.tolist(), rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("limit", "inside"), [(0.7, True), (1e-6, False)])
 def test_the_example_prints_controls_within_their_limits_if_some_readings_lead_there(limit, inside, tmp_path):
     """From the middle of X₀, 3 rad from the goal, the first control is at its limit."""

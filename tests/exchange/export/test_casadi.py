@@ -15,6 +15,7 @@ from tests.pages import ROOT
 casadi = pytest.importorskip("casadi")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", ["double_integrator", "pendulum_limited", "reacher_family"])
 def test_values_and_the_derivative_of_v(name, tmp_path):
     controller = lyapnet.load(f"zoo:{name}")

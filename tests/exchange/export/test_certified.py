@@ -170,6 +170,7 @@ def test_what_is_no_export_is_refused(exported, tmp_path):
         certify(controller, Funnel(states=D, time="continuous", file=CertifiedFiles(controller, folder).law()))
 
 
+@pytest.mark.gate
 def test_limits_of_single_precision_are_moved_inwards_and_count(tmp_path):
     controller = integrator(controls=ControlBox(torch.tensor(-0.7).double(), torch.tensor(0.3).double()))
     export(controller, tmp_path / "c", "c", dtype="float32")

@@ -69,6 +69,7 @@ def answers_of_main(folder):
     return u, V
 
 
+@pytest.mark.gate
 @needs_compiler
 @pytest.mark.parametrize("kind", sample(KINDS, 9))
 def test_c_says_what_the_controller_says(kind, tmp_path):
@@ -84,6 +85,7 @@ def test_c_says_what_the_controller_says(kind, tmp_path):
     assert ("PARAMETERS" in (tmp_path / "law" / "policy.h").read_text()) == (kind == "a family")
 
 
+@pytest.mark.gate
 @needs_compiler
 @pytest.mark.parametrize("kind", ["a limit, held", "a family"])
 def test_in_python_it_is_one_state_after_another(kind):

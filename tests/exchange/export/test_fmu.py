@@ -38,6 +38,7 @@ def signal(names, values, dt):
     return np.array(rows, dtype=[("time", float), *((name, float) for name in names)])
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("version", sample(VERSIONS, 2))
 def test_it_has_a_description_its_source_and_a_binary(version, tmp_path):
     file = unit_of(LOOPS["one state"](), tmp_path, version, name="level")

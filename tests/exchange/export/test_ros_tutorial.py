@@ -69,6 +69,7 @@ STEP = 10_000_000
 X = (0.7, -0.4, 0.2, 0.1)
 
 
+@pytest.mark.gate
 @needs_compilers
 def test_it_publishes_what_the_controller_says(run):
     controller = lyapnet.load("zoo:reacher_limited", beyond=BEYOND)

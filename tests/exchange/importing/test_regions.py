@@ -67,6 +67,7 @@ def refused(folder, capsys, *options, V=None, u=None, config=CONFIG):
     return error
 
 
+@pytest.mark.gate
 def test_of_a_linear_law_the_largest_ellipse_is_proved(tmp_path, capsys):
     result = certified(tmp_path, capsys)
     largest = float((D.upper**2 / torch.from_numpy(P).inverse().diagonal()).min())
@@ -222,6 +223,7 @@ def test_a_law_within_its_limits_makes_no_note(tmp_path, caplog):
 # What must not be certified
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("V", sample([-P, np.diag([1.0, -1.0]), np.diag([1.0, 0.0])], 3))
 def test_an_indefinite_V_has_no_region(V, tmp_path, capsys):
     result = certified(tmp_path, capsys, "--seconds=3", V=quadratic(V))
@@ -325,6 +327,7 @@ def rise(controller, point, side):
     return float(V[fall >= 0].min()) if bool((fall >= 0).any()) else math.inf
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", ["V", "u"])
 @pytest.mark.parametrize("seed", sample(range(20), 20))
 def test_no_region_is_certified_over_a_planted_bump(kind, seed, tmp_path):

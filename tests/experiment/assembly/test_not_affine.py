@@ -43,6 +43,7 @@ def controller_of(law=SampledPolicy, **changes):
 # What knows them
 
 
+@pytest.mark.gate
 def test_a_target_is_solved_for_and_linearised():
     problem = build_problem(config_from_plain(GLIDER))
     assert problem.system.dynamics(problem.goal, problem.rest).abs().max() < 1e-9
@@ -53,6 +54,7 @@ def test_a_target_is_solved_for_and_linearised():
     assert (f - expected).abs().max() > 1e-2
 
 
+@pytest.mark.gate
 def test_a_family_has_other_parameters_in_its_dynamics():
     problem = build_problem(config_from_plain({**GLIDER, "family": {"mass": [1.5, 2.5]}, "target": {"speed": 12}}))
     x = problem.initial_states.sample(6, torch.Generator().manual_seed(0))
@@ -62,6 +64,7 @@ def test_a_family_has_other_parameters_in_its_dynamics():
         assert torch.allclose(problem.system.dynamics(each, u)[:2], member.dynamics(each[:2], u))
 
 
+@pytest.mark.gate
 def test_a_record_tells_other_dynamics():
     problem = build_problem(config_from_plain(GLIDER))
     record = problem.record()
@@ -123,6 +126,7 @@ def test_proofs_are_refused_by_name(claim):
         lyapnet.certify(controller_of(), claim)
 
 
+@pytest.mark.gate
 def test_samples_are_not_refused():
     certificate = lyapnet.certify(controller_of(), lyapnet.Sampled(samples=4))
     assert certificate.verdict

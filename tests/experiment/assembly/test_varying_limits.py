@@ -101,6 +101,7 @@ def test_optimum_and_shares_of_steps_at_limits_are_those_of_the_moving_limits():
     assert found["at_limits"]["torque"]["upper"] > 0
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("form", ["c", "c in float32", "torch", "onnx"])
 def test_an_exported_law_stays_within_the_limits(form, tmp_path):
     if form == "onnx":
@@ -121,6 +122,7 @@ def compiled_in(folder, own, dtype):
     return CompiledLaw(folder, Law(own, kind), 1, c.FLAGS, c.Style(c.NAME, kind), None)
 
 
+@pytest.mark.gate
 def test_limits_of_a_users_own_are_not_written_in_another_precision(tmp_path):
     own = controller(controls={"name": f"{__name__}:OfAngle"})
     export(own, tmp_path / "law", "c")
@@ -128,6 +130,7 @@ def test_limits_of_a_users_own_are_not_written_in_another_precision(tmp_path):
         export(own, tmp_path / "other", "c", dtype="float32")
 
 
+@pytest.mark.gate
 def test_pages_and_figures_show_the_controls_that_act():
     own = controller()
     loop = own.rollout(states(3))

@@ -33,6 +33,7 @@ def test_without_noise_parameters_are_found_to_a_millionth(name):
     assert not found.unknown_directions
 
 
+@pytest.mark.gate
 def test_true_parameters_are_in_the_region(monkeypatch):
     """A sample of the table in docs/identify.md: with 95 % each, at least 4 of 6 with a probability of 99.8 %."""
     monkeypatch.setitem(PLANTS, "tanks", PLANTS["tanks"]._replace(seconds=20.0))
@@ -51,6 +52,7 @@ def test_the_noise_is_found():
     assert found.model_is_right
 
 
+@pytest.mark.gate
 def test_intervals_count_with_coloured_noise():
     """Of one recording: the spread of estimates under noise that is as large and white is less than half as wide."""
     white, coloured = (found_of("tanks", 40.0, colour=colour) for colour in (0.0, 0.95))
@@ -91,6 +93,7 @@ def swinging():
     return Measurements("a", t, np.zeros(angle.shape), angle + noise, ("angle",))
 
 
+@pytest.mark.gate
 def test_a_parameter_that_has_no_effect_on_the_data_is_named(swinging):
     """Mass does not count without a torque."""
     settings = PLANTS["pendulum"]._replace(config={"mass": 1.3, "length": 0.6}).settings()
@@ -105,6 +108,7 @@ def test_a_parameter_that_has_no_effect_on_the_data_is_named(swinging):
     assert both == [{"mass": 1.0}, pytest.approx({"length": 1.0, "gravity": 1.0}, rel=1e-3)]
 
 
+@pytest.mark.gate
 def test_a_parameter_that_the_data_hardly_tell_is_named():
     """Noise alone moves the readings of a pendulum at rest."""
     t = np.arange(0, 4, 0.02)
@@ -117,6 +121,7 @@ def test_a_parameter_that_the_data_hardly_tell_is_named():
 # A wrong model, and its twin
 
 
+@pytest.mark.gate
 def test_a_wrong_model_is_told_by_its_residuals():
     right = found_of("pendulum", 6.0)
     wrong = found_of(
@@ -143,6 +148,7 @@ def test_a_noise_that_is_said_is_held_against_the_residuals(said, right):
 # Files, pieces, readings
 
 
+@pytest.mark.gate
 def test_what_is_held_out_is_not_fitted():
     plant = PLANTS["tanks"]
     one, other = record(plant, [0, 1], seconds=20.0)
@@ -165,6 +171,7 @@ def test_several_files_tell_more_than_one():
     assert all_three.pieces == 3
 
 
+@pytest.mark.gate
 def test_a_plant_that_falls_is_followed_in_pieces():
     """Errors grow 20-fold in a second: no trajectory follows it for long, while pieces do, and tell what they can."""
     system = Pendulum(1.0, 0.5, 0.1).double()
@@ -188,6 +195,7 @@ def test_a_plant_that_falls_is_followed_in_pieces():
 # What is refused
 
 
+@pytest.mark.gate
 def test_parameters_count_where_initial_states_are_fixed():
     """Friction of a cart-pole that begins at rest."""
     fixed = {"initial_states": {"lower": [0, 3.1, 0, 0], "upper": [0, 3.2, 0, 0]}}

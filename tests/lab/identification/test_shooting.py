@@ -40,6 +40,7 @@ def test_segments_are_joined_into_one_integration():
     np.testing.assert_allclose(path.y, torch.stack(read).numpy(), atol=1e-8)
 
 
+@pytest.mark.gate
 def test_derivatives_are_those_of_finite_differences():
     shot = shooting()
     p, x0, nodes = start_of(shot)

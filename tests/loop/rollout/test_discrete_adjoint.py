@@ -96,6 +96,7 @@ def test_gradient_of_every_output_is_that_of_backpropagation(system, cost, polic
         assert error(slopes(discrete, x0, partial(weighted, without=name)), expected) > 1e-3
 
 
+@pytest.mark.gate
 @in_trace
 @pytest.mark.parametrize("method", sample(FIXED_STEP_METHODS, 3))
 @pytest.mark.parametrize("system", ["cartpole"], indirect=True)
@@ -562,6 +563,7 @@ def test_parameters_and_buffers_are_read_at_every_rollout(system, cost, policy, 
     changes(rollouts, x0, lambda: setattr(system, "B", 2 * system.B))
 
 
+@pytest.mark.gate
 @double_integrator
 @in_both_forms
 def test_frozen_parameters_get_no_gradient(system, cost, V, policy, x0):

@@ -183,6 +183,7 @@ ADJOINTS = {  # options of the rollout: error of its gradient
 }
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("system", KINDS, indirect=True)
 def test_adjoint_is_the_gradient_of_the_continuous_problem(system, cost, policy, x0, directions):
     """With Euler up to O(Δt), measured; with the others to the tolerance they are used for."""

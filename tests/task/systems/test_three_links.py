@@ -64,6 +64,7 @@ def test_no_library_call_is_left_in_the_trace_of_dynamics_and_their_derivatives(
     assert TEMPTING & operators(trace(lambda x: (torch.linalg.inv(arm.mass_matrix(x[:, :3])),), states(4)[:1]))
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("R", ["inverse mass", "constant"])
 def test_the_discrete_gradient_is_that_of_backpropagation(R, arm):
     cost = QuadraticCost(torch.eye(6), arm.inverse_mass if R == "inverse mass" else torch.eye(3) + 0.2, torch.eye(6))

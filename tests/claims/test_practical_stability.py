@@ -165,7 +165,8 @@ def test_nothing_is_proved_of_a_hole_that_is_too_small(monkeypatch):
     claim = claimed(disturbance=W)
     assert claim.rho == -math.inf
     assert claim.verdict != "certified"
-    monkeypatch.setattr(region, "ultimate_level", lambda *_: 2 * pushed_claim().hole)
+    hole = 2 * pushed_claim().hole
+    monkeypatch.setattr(region, "ultimate_level", lambda *_: hole)
     assert claimed(disturbance=W).verdict == "certified"
 
 

@@ -61,7 +61,7 @@ def certified_region(rollout: Callable[[State], Trajectory], problem: Problem, t
     sets of V(0, ·) and some closed loops are drawn over it. With one free component the sum itself is drawn.
     """
     system, initial_states = problem.system, problem.initial_states
-    region = widest_slice(initial_states, 41 if _free_components(initial_states) > 1 else 101)
+    region = widest_slice(initial_states, 31 if _free_components(initial_states) > 1 else 101)
     with torch.no_grad():
         trajectory = rollout(region.states)
     values = trajectory.require_value()

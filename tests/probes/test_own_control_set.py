@@ -205,7 +205,10 @@ def test_the_same_set_from_python(limits):
         ("controls.parameters.limits=1", "Expected parameters of limits:Limits (limit), got"),
         ("controls.name=limits:Nothing", "Expected controls.name as a class of limits, got 'limits:Nothing'"),
         ("controls.name=limits:Limit", "did you mean limits:Limits?"),
-        ("controls.name=nothing", "Expected controls.name as one of unbounded, or module:Class, got 'nothing'"),
+        (
+            "controls.name=nothing",
+            "Expected controls.name as one of unbounded, ball, ellipsoid, polytope, table, or module:Class, got ",
+        ),
         ("controls.name=absent:Limits", "Expected controls.name as module:Class, got 'absent:Limits' (ModuleNotFound"),
         ("controls.name=pathlib:Path", "Expected controls.name as a subclass of ControlSet"),
     ],

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
-from lyapnet.base.files import write_atomically
 from lyapnet.base.types import Control
 from lyapnet.graphs.compilation import cache_folder, constants_of
 from lyapnet.task.sets import ControlSet
@@ -46,17 +45,14 @@ class OptimaCache:
         return u if fits else None
 
     def write(self, x0: Tensor, u: Control) -> None:
-        """Store the controls of a state (n,), replacing earlier ones."""
+        """Store the controls of a state (n,), replacing earlier ones; checksums find a torn file when it is read."""
         content = io.BytesIO()
         np.savez(content, u=u.numpy())
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.TemporaryDirectory(
-                dir=self.folder, prefix=".new_"
-            ) as draft:  # no other process uses this folder
-                path = Path(draft) / "optimum"
-                write_atomically(path, content.getvalue())
-                path.replace(self._file(x0))
+            with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".new_", delete=False) as draft:
+                draft.write(content.getvalue())
+            Path(draft.name).replace(self._file(x0))
 
     def _file(self, x0: Tensor) -> Path:
         return self.folder / f"{_hash(x0.numpy().tobytes())}.npz"

@@ -45,7 +45,7 @@ def missing(page: str) -> list[str]:
 
 def test_every_figure_of_the_leaderboard_is_in_the_file_that_its_row_names():
     page = LEADERBOARD.read_text(encoding="utf-8")
-    assert sum(len(FIGURE.findall(cells)) for cells, _ in rows(page)) >= 150
+    assert sum(len(FIGURE.findall(cells)) for cells, _ in rows(page)) >= 100
     assert missing(page) == []
     assert missing(page.replace("| 1.0654 (", "| 1.0653 (")) == ["1.0653"]
 

@@ -116,20 +116,21 @@ def test_the_zoo_is_listed(capsys):
     assert printed.count("float64") == printed.count("float32") == len(NAMES)
 
 
-def test_what_follows_the_end_is_as_the_page_has_it(monkeypatch, capsys):
+def test_what_follows_the_end_is_as_the_record_and_the_page_have_it(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["zoo", "--after"]) == 0
     printed = capsys.readouterr().out.splitlines()
-    page = (ROOT / "docs" / "beyond.md").read_text().splitlines()
     for name in NAMES:
-        (shown,), (told,) = ([row for row in rows if f" {mark} " in row] for rows, mark in (
-            (printed, name), (page, f"`zoo:{name}`")
-        ))  # fmt: skip
-        cells = [cell.strip() for cell in shown.split("│")[2:-1]]
-        assert cells == [cell.strip(" `") for cell in told.split("|")[2:-1]]
+        (shown,) = [row for row in printed if f" {name} " in row]
         record, noted = entry(name).record["afterwards"], read_checkpoint(f"zoo:{name}")[KEY]["after_horizon"]
-        assert record["beyond"] == noted["beyond"]
+        law, held, *distances = [cell.strip() for cell in shown.split("│")[2:-1]]
+        assert (law, held) == (record["beyond"], f"{record['held']} of {record['loops']}")
+        for cell, distance in zip(distances, record["distance"].values(), strict=True):
+            assert distance < 1e-12 if cell == "< 1e-12" else float(cell) == pytest.approx(distance, rel=0.06)
+        assert record["beyond"] == noted["beyond"] == ("hold" if name == "bryson_denham" else "riccati")
         assert record["held"] == noted["held"] == (0 if name == "bryson_denham" else 64)
+    page = " ".join((ROOT / "docs" / "beyond.md").read_text(encoding="utf-8").split())
+    assert f"all {len(NAMES) - 1} with a goal that can be held" in page
 
 
 @pytest.mark.gate

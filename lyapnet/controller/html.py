@@ -164,9 +164,9 @@ def _drawing(controller: Any) -> str:
     box, system, horizon = controller.initial_states, controller.system, controller.horizon
     x0 = torch.cat([box.center[None], box.corners(2)])
     controller.policy(0.0, x0)  # the first call of a law is slower
-    begun = time.perf_counter()
+    begun = time.thread_time()  # of work, which other programs do not prolong
     controller.policy(0.0, x0)
-    expected = horizon.steps * (time.perf_counter() - begun)
+    expected = horizon.steps * (time.thread_time() - begun)
     if expected > SECONDS:
         return _note(
             f"There is no drawing of closed loops: they take about {expected:.0f} s; ask controller.rollout(x0)."

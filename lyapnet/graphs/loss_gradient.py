@@ -5,28 +5,39 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from lyapnet.base.threads import in_threads, size_of_parts
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, kernel_or_none
 from lyapnet.graphs.stateless import state_of, stateless, trained_of
 from lyapnet.graphs.tracing import trace
+
+ROWS_PER_PART = 128  # at least
 
 
 def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., None]:
     """A function (*arguments) that writes the gradient of loss(*arguments) to `grad` of its trained parameters.
 
-    On a CPU the loss and its gradient are traced and run by lyapnet's kernel, with the current parameters and buffers.
-    A loss that cannot be traced, or with an operation that the kernel lacks, is differentiated by torch.
+    On a CPU the loss and its gradient are traced and run by lyapnet's kernel, with the current parameters and buffers,
+    in parts of equal size on several threads. The parts do not depend on the number of threads, nor does the result. A
+    loss that cannot be traced, or with an operation that the kernel lacks, is differentiated by torch.
 
     Args:
+        loss: a mean over the rows of its arguments.
         arguments: examples with the shapes and types of every call.
     """
-    trained = trained_of(loss)
-    kernel = _kernel(loss, arguments)
+    trained, rows = trained_of(loss), len(arguments[0])
+    size = size_of_parts(rows, ROWS_PER_PART)
+    kernel = _kernel(loss, [column[:size] for column in arguments])
+
+    def by_kernel(kernel: NumberKernel, arguments: Sequence[Tensor]) -> list[Tensor]:
+        state, columns = state_of(loss), [column.split(size) for column in arguments]
+        parts = in_threads(lambda part: kernel(*state, *part), [*zip(*columns, strict=True)])
+        return [torch.stack(slopes).sum(0) * (size / rows) for slopes in zip(*parts, strict=True)]
 
     def differentiate(*arguments: Tensor) -> None:
         if kernel is None:
             gradient = torch.autograd.grad(loss(*arguments), trained, allow_unused=True)
         else:
-            gradient = kernel(*state_of(loss), *arguments)
+            gradient = by_kernel(kernel, arguments)
         for parameter, slope in zip(trained, gradient, strict=True):
             parameter.grad = slope
 

@@ -53,7 +53,7 @@ def later_optima(
         path: the closed loops.
         is_known: (N, b), whether V is known from the expansion around the optimum.
         generator: chooses among more than MAX_LOST_LOOPS loops.
-        seconds: CPU seconds of this thread for each time.
+        seconds: seconds of work for each time.
         progress: called with the number of finished searches and their total.
     """
     problem = in_float64(problem)

@@ -1,7 +1,6 @@
 """Optimal trajectories from many states of X₀, each search warm-started from its neighbours' optima."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -9,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.random_streams import START, stream
+from lyapnet.base.threads import seconds_of_work
 from lyapnet.base.types import Control, ControlPath, State
 from lyapnet.evaluation.oracles import Optima, optimal_cost
 from lyapnet.task.problem import Problem
@@ -35,7 +35,7 @@ BY_ORACLE = 16  # first of these states, which the oracle solves too
 RANDOM_GUESSES = 6  # random controls as initial guesses if there is no expansion
 MAX_DERIVATIVE_ENTRIES = 50_000_000  # numbers in all second derivatives (400 MB), which limits the optima
 MAX_CURVATURE_RATIO = 100  # largest entry of V_xx relative to its median: more than this is no minimum
-SEARCH_SECONDS = 30.0  # CPU seconds of this thread for each of the three searches
+SEARCH_SECONDS = 30.0  # seconds of work for each of the three searches
 ORACLE_IMPROVEMENT = 0.999  # cost ratio below which the optimum of the oracle replaces ours
 MIN_IMPROVED_SHARE = 0.25  # share of improved optima from which on the oracle solves all states
 NEIGHBOURS = 4  # nearest states whose optima are tried as initial guesses
@@ -122,14 +122,14 @@ def _improve_by_oracle(
 
     Also returns the oracle's controls from the other states, NaN where it ran out of time; None if it did not try them.
     """
-    oracle, began = optimal_cost(problem.without_noise()), time.thread_time()
+    oracle, began = optimal_cost(problem.without_noise()), seconds_of_work()
     if oracle is None:  # not installed, or not applicable to this problem
         return optimum, None
     progress = partial(report, f"optima by the oracle within {SEARCH_SECONDS:.0f} s of work")
     x0, far = optimum.path.x[0], min(BY_ORACLE, len(optimum.path.cost))
     found = oracle.solve(x0[:far], progress=progress, seconds=SEARCH_SECONDS)
     optimum, gained = _replace_improved(problem, optimum, torch.arange(far), found)
-    left = SEARCH_SECONDS - (time.thread_time() - began)
+    left = SEARCH_SECONDS - (seconds_of_work() - began)
     if gained < MIN_IMPROVED_SHARE * far or left < 0:
         return optimum, None
     found = oracle.solve(torch.cat([x0[far:], others]), progress=progress, seconds=left)

@@ -2,7 +2,6 @@
 
 import copy
 import math
-import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.random_streams import START, stream
+from lyapnet.base.threads import seconds_of_work
 from lyapnet.base.types import Control, PerState, State, StatePath
 from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
@@ -39,7 +39,7 @@ from lyapnet.value.policy import LookaheadPolicy
 
 BATCH_SIZE = 512  # examples in a step
 BRIEF_STEPS = 200  # steps of a brief fit, which compares initial values of V
-FIT_SECONDS = 60.0, 30.0  # CPU seconds of this thread for the first fit and for each further round, at most
+FIT_SECONDS = 60.0, 30.0  # seconds of work for the first fit and for each further round, at most
 PACE_SHARE = 0.1  # share of these seconds after which the pace decides whether the learning rate falls by time instead
 MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
 NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
@@ -423,14 +423,14 @@ class _Fit:
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
-        """Minimise the loss with a cosine learning rate, over a number of steps or CPU seconds of this thread.
+        """Minimise the loss with a cosine learning rate, over a number of steps or seconds of work.
 
         Where the seconds suffice for all steps the result does not depend on them.
         """
-        trained, began = self._trained, time.thread_time()
+        trained, began = self._trained, seconds_of_work()
         examples, optimizer = examples.to(trained[0]), self.method.optimizer(trained, rate)
         for k in range(steps):
-            spent = (time.thread_time() - began) / seconds
+            spent = (seconds_of_work() - began) / seconds
             share = max(k / steps, spent if spent > PACE_SHARE else 0.0)
             if share >= 1:
                 break

@@ -71,3 +71,18 @@ def test_a_batch_of_another_size_is_refused():
     differentiate = gradient_of_loss(Residual(), batch(0))
     with pytest.raises(ValueError, match="Expected arguments"):
         differentiate(*(column[:3] for column in batch(0)))
+
+
+def test_parts_of_a_batch_give_the_same_gradient_on_any_number_of_threads(monkeypatch):
+    loss, columns = Residual(), [torch.cat([column] * 64) for column in batch(0)]
+    columns = [column[torch.randperm(len(column), generator=torch.Generator().manual_seed(1))] for column in columns]
+    differentiate, found = gradient_of_loss(loss, columns), []
+    sizes, run = set(), KERNEL.__call__
+    monkeypatch.setattr(KERNEL, "__call__", lambda *given: sizes.add(len(given[-1])) or run(*given))
+    for threads in (1, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        differentiate(*columns)
+        found.append(slopes(loss))
+        assert_close(slopes(loss), [*by_torch(loss, columns)], rtol=1e-12, atol=1e-14)
+    assert sizes == {224}, "448 rows in two parts"
+    assert all(map(torch.equal, *found))

@@ -10,11 +10,12 @@ from torch import nn
 from torch.testing import assert_close
 
 import lyapnet
+from lyapnet.base.threads import in_threads
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.graphs.compilation import has_compiler
 from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.assembly import SOURCE
-from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
 from lyapnet.graphs.number_kernel.program import OPERATIONS
 from lyapnet.graphs.number_kernel.rewriting import rewrite
 from lyapnet.graphs.scan import Scan

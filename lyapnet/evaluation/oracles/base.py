@@ -48,7 +48,7 @@ class Oracle(ABC):
         Args:
             known: controls from each x₀, (N, b, m), an additional initial guess for an iterative oracle.
             progress: called with the number of states that are done.
-            seconds: CPU seconds of this thread after which an iterative oracle tries no further state.
+            seconds: seconds of work after which an iterative oracle tries no further state.
         """
 
     def __call__(self, x0: State) -> PerState:

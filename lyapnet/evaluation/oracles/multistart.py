@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lyapnet.base.threads import seconds_of_work
 from lyapnet.evaluation.oracles.base import Report
 
 HOPELESS = 8  # if the first states fail in such a number, the others are not tried
@@ -68,12 +69,12 @@ class MultiStart:
         """Try the initial guesses of some states, given by their indices, and the optima of the states around.
 
         Args:
-            until: CPU time of this thread after which no further state is tried.
+            until: value of seconds_of_work after which no further state is tried.
         """
         failures, last = 0, ""  # consecutive failures from the first state on, -1 after a success; the last reason
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
-            if time.thread_time() > until:
+            if seconds_of_work() > until:
                 self.reasons[i] = self.reasons[i] or "no time was left for it"
                 continue
             if failures == HOPELESS:
@@ -93,7 +94,7 @@ class MultiStart:
             if done == min(self.explored, len(starts)) - 1:
                 explored = [*starts][: self.explored]
                 self._exchange(explored, explored)
-        if self.several and time.thread_time() <= until:
+        if self.several and seconds_of_work() <= until:
             self._exchange(starts, range(len(self.x0)))
         progress(len(starts), len(starts))
 

@@ -4,7 +4,6 @@ A reference for tests and tables. The model is the torch system itself, translat
 """
 
 import math
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from io import StringIO
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import Interrupted, signals_taken
+from lyapnet.base.threads import seconds_of_work
 from lyapnet.base.types import ControlPath, PerState, State, StatePath
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
@@ -122,7 +122,7 @@ class Transcription(Oracle):
             first = [pending[len(pending) * k // explored] for k in range(min(explored, len(pending)))]
             pending = [*first, *(i for i in pending if i not in first)]
             starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
-            self._search(search, starts, progress, time.thread_time() + seconds)
+            self._search(search, starts, progress, seconds_of_work() + seconds)
             if search.several:
                 _SINGLE_MINIMUM_TASKS.discard(self._task_and_box)
             elif explored == EXPLORED and self._is_spread(states[pending[:EXPLORED]], search):

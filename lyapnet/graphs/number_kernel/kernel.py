@@ -1,7 +1,6 @@
 """Runs traced functions as flat programs in compiled C++, instead of calling torch's operators one by one."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import torch
@@ -16,8 +15,6 @@ from lyapnet.graphs.scan import Scan
 
 CHECKED = 2  # steps of a scan that are compared with torch
 Kernel = TypeVar("Kernel", bound="NumberKernel | ScanKernel")
-Part = TypeVar("Part")
-Result = TypeVar("Result")
 
 
 class NumberKernel:
@@ -111,15 +108,6 @@ def _split(arguments: Sequence[Tensor], columns: int) -> tuple[Sequence[Tensor],
     """(state, columns over time, x₀) of the arguments of a scan."""
     *state, x0 = arguments
     return state[: len(state) - columns], state[len(state) - columns :], x0
-
-
-def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """The results for several parts in their order, on as many threads as torch uses: programs release the GIL."""
-    count = min(torch.get_num_threads(), len(parts))
-    if count < 2:
-        return [function(part) for part in parts]
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(function, parts))
 
 
 def _require_same(results: Sequence[Tensor], expected: Sequence[Tensor]) -> None:

@@ -17,14 +17,14 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lyapnet.base.errors import UntraceableError
+from lyapnet.base.threads import in_threads, size_of_parts
 from lyapnet.base.types import ControlPath, StagePath, State, StatePath, ValuePath
 from lyapnet.graphs.agreement import are_close
-from lyapnet.graphs.number_kernel.kernel import in_threads
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
 from lyapnet.loop.rollout.backwards import BlockwiseGradient, PathWithDerivatives, padded
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.loop.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
+from lyapnet.loop.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines, in_parts
 from lyapnet.loop.rollout.runge_kutta import Linearise, Step
 from lyapnet.task.horizon import TABLEAUX
 from lyapnet.task.noise import Increments
@@ -32,6 +32,7 @@ from lyapnet.task.noise import Increments
 _LOG = logging.getLogger(__name__)
 RolledPath = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
 CHECKED_STEPS = 6  # steps of a rollout at which a trace or shared code is compared with the loop itself
+STATES_PER_PART = 16  # closed loops of a batch on one thread, at least: with 8 the kernel needs a third more work
 STATES_PER_BLOCK = 512  # states linearised at once: 64 hidden units each in float64 are 256 kB, which fit into a cache
 STATES_PER_BLOCK_ON_GPU = 131_072  # the same on a GPU
 
@@ -97,7 +98,12 @@ class DiscreteAdjoint:
             CompilationError: as TracedRoutines.compiled.
         """
         if self._compiled_key != self._key(x0):
-            self._set_compiled(self._work(x0).compiled(), x0)
+            size = len(x0)
+            # a limit of the costates is relative to their median in the batch; increments are not divided
+            if x0.device.type == "cpu" and self.costate_limit is None and self.loop.noise is None:
+                size = size_of_parts(size, STATES_PER_PART)
+            compiled = self._work(x0[:size]).compiled()
+            self._set_compiled(compiled if size == len(x0) else in_parts(compiled, size), x0)
 
     @property
     def compiled_batch(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 
 from lyapnet.base.errors import CompilationError, LyapnetError, UntraceableError, one_line
+from lyapnet.base.threads import in_threads
 from lyapnet.base.types import ControlPath, StagePath, State, ValuePath
 from lyapnet.graphs.compilation import compilation_errors
 from lyapnet.graphs.cuda_graphs import RecordedFunction, Replay, record
@@ -42,6 +43,27 @@ class Routines(NamedTuple):
     # (*state, t, Δt, x₀), with noise ΔW before x₀ ↦ the columns of Nodes at the nodes t
     integrate: Callable[..., Sequence[Tensor]]
     gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
+
+
+def in_parts(routines: Routines, size: int) -> Routines:
+    """Routines for a batch, from those for a part of it: parts of that size run on several threads.
+
+    The parts do not depend on the number of threads, nor do the results.
+    """
+
+    def integrate(*arguments: Tensor) -> list[Tensor]:
+        *state, t, dt, x0 = arguments
+        parts = in_threads(lambda rows: routines.integrate(*state, t, dt, rows), x0.split(size))
+        return [torch.cat(column, axis) for column, axis in zip(zip(*parts, strict=True), BATCH_AXES, strict=True)]
+
+    def gradient(state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
+        t, dt, stages, *derivatives = path.columns
+        rows = zip(stages.split(size, 2), *(column.split(size, 1) for column in derivatives), strict=True)
+        parts = in_threads(lambda part: routines.gradient(state, PathWithDerivatives(t, dt, *part)), [*rows])
+        costates, shares = zip(*parts, strict=True)
+        return torch.cat(costates), [torch.stack(share).sum(0) for share in zip(*shares, strict=True)]
+
+    return Routines(integrate, gradient)
 
 
 class TracedRoutines:

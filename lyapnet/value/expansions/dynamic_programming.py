@@ -18,7 +18,6 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 """
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.contracts import copied
+from lyapnet.base.threads import seconds_of_work
 from lyapnet.base.types import ControlPath, PerState, State, StatePath
 from lyapnet.task.cost import PenaltyCost, spread, squared_distance, time_cost_of
 from lyapnet.task.noise import Noise, once_if_constant
@@ -131,10 +131,10 @@ def optimal_trajectories(
         rivals: whether the controls are guesses from one state, of which only the best counts. Once one has settled,
             those that cost HOPELESS_COST_RATIO times as much are given up.
         progress: called with the number of finished trajectories and their total, averaged over the phases.
-        seconds: CPU seconds of this thread after which the descent stops.
+        seconds: seconds of work after which the descent stops.
         softer_first: whether softer costs come first where the task needs them; no if the guess is nearly optimal.
     """
-    until = time.thread_time() + seconds
+    until = seconds_of_work() + seconds
     noise, problem = in_float64(problem).noise, in_float64(problem).without_noise()
     x0, u = x0.double(), problem.controls.project(u.double())
 
@@ -164,7 +164,7 @@ def optimal_trajectories(
     if not programs.agrees(descent.now) and programs.forget():  # the problem's constants have changed
         problem = problem if noise is None else problem.replaced(noise=noise)
         return optimal_trajectories(
-            problem, x0, u, iterations, rivals, progress, until - time.thread_time(), softer_first
+            problem, x0, u, iterations, rivals, progress, until - seconds_of_work(), softer_first
         )
     return descent.optimum(noise)
 
@@ -229,14 +229,14 @@ def _from_softer_contact(
     if not lengths:
         return None
     programs, best = StepPrograms(softer, STEP_SIZES), None
-    share = (until - time.thread_time()) / (2 * 3 * len(LONGER))  # all of them take at most half of what is left
+    share = (until - seconds_of_work()) / (2 * 3 * len(LONGER))  # all of them take at most half of what is left
     for factor in LONGER:
         for length, value in lengths:
             length.fill_(factor * value)
         starts = [_as_guess(path) for path in (guess, best) if path is not None]
         if softer.has_goal:
             starts.append(path_under(softer, greedy_law(softer, riccati(softer)), guess.x[0]))
-        best = cheapest([_reached(descend(programs, start, False, 0, time.thread_time() + share)) for start in starts])
+        best = cheapest([_reached(descend(programs, start, False, 0, seconds_of_work() + share)) for start in starts])
     return best
 
 
@@ -302,7 +302,7 @@ class _Descent:
         for k in range(iterations):
             rows = torch.nonzero(~settled).flatten()
             progress(len(settled) - len(rows))
-            if not len(rows) or time.thread_time() > until:
+            if not len(rows) or seconds_of_work() > until:
                 break
             previous, backward = self._pass(rows, damping[rows])
             expected = (previous.cost - backward.expansion.value[0]).abs()

@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.base.linear_algebra import apply
+from lyapnet.base.threads import in_threads
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 from lyapnet.graphs.agreement import THIRD, are_close
-from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads, kernel_or_none
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, kernel_or_none
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, stateless
 from lyapnet.graphs.tracing import cut, trace

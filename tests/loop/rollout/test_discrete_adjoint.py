@@ -12,6 +12,8 @@ from torch.testing import assert_close
 
 from lyapnet.base.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.graphs.compilation import has_compiler
+from lyapnet.graphs.number_kernel.kernel import ScanKernel
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.loop.rollout import FIXED_STEP_METHODS, Rollout, backwards, discrete_adjoint, routines
 from lyapnet.loop.rollout.runge_kutta import Linearise
@@ -324,6 +326,44 @@ def test_batches_of_two_sizes_in_turn(system, cost, policy):
     rollouts = routes(system, cost, policy)
     for size in (3, 2, 3):
         is_exact(rollouts, torch.randn(size, system.n))
+
+
+@in_trace
+@double_integrator
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_a_compiled_batch_in_parts_has_the_same_gradient_on_any_number_of_threads(system, cost, policy, monkeypatch):
+    rollouts, x0 = routes(system, cost, policy), torch.randn(32, system.n)
+    rollouts[0].discrete.compile(x0)
+    kept = rollouts[0].discrete.routines(x0)
+    sizes, integrate = set(), ScanKernel.__call__
+    monkeypatch.setattr(ScanKernel, "__call__", lambda *a: sizes.add(len(a[-1])) or integrate(*a))
+    found = []
+    for threads in (1, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        is_exact(rollouts, x0)
+        found.append([*slopes(rollouts[0], x0), rollouts[0](x0).cost.detach()])
+    assert sizes == {16}
+    assert all(map(torch.equal, *found))
+    assert rollouts[0].discrete.routines(x0) is kept
+
+
+@in_trace
+@double_integrator
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_a_batch_whose_costates_are_limited_is_one_part(system, cost, policy, monkeypatch):
+    """The limit is relative to the median of the whole batch."""
+    x0, found = torch.randn(32, system.n), []
+    problem = problem_of(system, cost, HORIZON.steps, HORIZON.dt)
+    for compiled in (True, False):
+        rollout = Rollout(problem, policy, "euler", "discrete", costate_limit=1.1)
+        if compiled:
+            rollout.discrete.compile(x0)
+        found.append(slopes(rollout, x0))
+    assert error(*found) < EXACT
+    divided = Rollout(problem, policy, "euler", "discrete", costate_limit=1.1)
+    parts = routines.in_parts(divided.discrete._work(x0[:16]).compiled(), 16)
+    monkeypatch.setattr(divided.discrete, "routines", lambda _: parts)
+    assert error(slopes(divided, x0), found[1]) > 1e-6
 
 
 @double_integrator

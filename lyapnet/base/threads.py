@@ -1,0 +1,54 @@
+"""Work that is divided over threads, and the seconds that it takes."""
+
+import functools
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import torch
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+_this = threading.local()  # of each thread: is_worker, and waited, the seconds for which it waited for its workers
+
+
+def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """The results for several parts in their order, on as many threads as torch uses.
+
+    It pays for compiled programs, which release Python's lock. A function that divides its own part again runs on the
+    thread that it has.
+    """
+    count = min(torch.get_num_threads(), len(parts))
+    if count < 2 or getattr(_this, "is_worker", False):
+        return [function(part) for part in parts]
+
+    def run(part: Part) -> tuple[Result, float]:
+        began, _this.is_worker = time.thread_time(), True
+        with torch.no_grad():  # each thread has a grad mode of its own
+            return function(part), time.thread_time() - began
+
+    done = list(_workers(count, os.getpid()).map(run, parts))
+    _this.waited = getattr(_this, "waited", 0.0) + sum(seconds for _, seconds in done) / count
+    return [result for result, _ in done]
+
+
+def size_of_parts(rows: int, least: int) -> int:
+    """The smallest size, of at least a number of rows, in which all parts of a batch are equally large."""
+    return next(size for size in range(min(least, rows), rows + 1) if not rows % size)
+
+
+def seconds_of_work() -> float:
+    """CPU seconds of this thread, with those of its workers divided by their number: limits of work in all searches.
+
+    Seconds for which other programs have the machine do not count.
+    """
+    return time.thread_time() + getattr(_this, "waited", 0.0)
+
+
+@functools.lru_cache(maxsize=4)
+def _workers(count: int, process: int) -> ThreadPoolExecutor:
+    """The threads of a process; one that was forked needs its own."""
+    return ThreadPoolExecutor(count, thread_name_prefix=f"lyapnet-{process}")

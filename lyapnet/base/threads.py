@@ -12,16 +12,27 @@ import torch
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
+CORES = torch.get_num_threads()  # before any choice: those of the machine, or OMP_NUM_THREADS
 _this = threading.local()  # of each thread: is_worker, and waited, the seconds for which it waited for its workers
+_of_programs: list[int] = []  # threads of compiled programs, if they are not those of torch
+
+
+def use_threads(count: int | None) -> None:
+    """Compute on a number of threads; None: on all CORES, but torch's own operations on one.
+
+    In small networks more threads of torch mostly wait for each other; compiled programs do not.
+    """
+    torch.set_num_threads(count or 1)
+    _of_programs[:] = [CORES] if count is None else []
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """The results for several parts in their order, on as many threads as torch uses.
+    """The results for several parts in their order, on several threads as `use_threads` says.
 
     It pays for compiled programs, which release Python's lock. A function that divides its own part again runs on the
     thread that it has.
     """
-    count = min(torch.get_num_threads(), len(parts))
+    count = min(*(_of_programs or [torch.get_num_threads()]), len(parts))
     if count < 2 or getattr(_this, "is_worker", False):
         return [function(part) for part in parts]
 

@@ -91,8 +91,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     """Tell the facts of the problem and of its start."""
     gc.disable()  # of what is imported now nothing is garbage, and looking for it takes a seventh of the time
     try:
-        import torch
-
+        from lyapnet.base.threads import use_threads
         from lyapnet.experiment.assembly import default_of, parts_of
         from lyapnet.experiment.config import load_config
         from lyapnet.training.build_learner import build_learner, build_problem_to_train
@@ -100,7 +99,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     finally:
         gc.enable()
     resolved = dataclasses.replace(load_config(config, overrides), seeds=1)
-    torch.set_num_threads(resolved.training.threads)
+    use_threads(resolved.training.threads)
     parts = parts_of(resolved)
     with default_of(resolved):
         learner = build_learner(resolved, build_problem_to_train(resolved, parts), parts)

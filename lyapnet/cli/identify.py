@@ -61,9 +61,8 @@ def identify(
         )
     with stages_of("identify") as report:
         report("importing torch")
-        import torch
-
         from lyapnet.base.files import write_atomically
+        from lyapnet.base.threads import use_threads
         from lyapnet.experiment.config import load_config
         from lyapnet.lab.identification import identify as find
         from lyapnet.lab.identification import read_measurements, system_of
@@ -72,7 +71,7 @@ def identify(
         from lyapnet.lab.identification.residual_network import identify_residual, require_equations
 
         resolved = load_config(config, overrides)
-        torch.set_num_threads(resolved.training.threads)
+        use_threads(resolved.training.threads)
         system, _ = system_of(resolved)
         if with_residual:
             require_equations(system)

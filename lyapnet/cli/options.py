@@ -112,6 +112,7 @@ class Given:
         """The controller."""
         import torch
 
+        from lyapnet.base.threads import use_threads
         from lyapnet.controller.loading import load
         from lyapnet.experiment.assembly import DTYPES
 
@@ -122,7 +123,7 @@ class Given:
             from lyapnet.exchange.importing import imported_controller
 
             controller = imported_controller(self.checkpoint, *self.functions, self.named)
-        torch.set_num_threads(controller.config.training.threads)
+        use_threads(controller.config.training.threads)
         torch.set_default_dtype(DTYPES[controller.config.training.precision])  # until the command ends
         return member_of(controller, self.at) if self.at else controller
 

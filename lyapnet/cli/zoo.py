@@ -56,8 +56,7 @@ def demo(
     began = time.monotonic()
     with stages_of("demo") as report:
         report(f"importing torch for {name}")
-        import torch
-
+        from lyapnet.base.threads import use_threads
         from lyapnet.claims.certify import certify
         from lyapnet.claims.kinds import Statistical
         from lyapnet.evaluation.after_horizon import share_at_goal
@@ -66,7 +65,7 @@ def demo(
         from lyapnet.value.after_horizon import HELD
         from lyapnet.zoo import entry
 
-        torch.set_num_threads(1)  # of such small networks more threads wait for one another on a busy machine
+        use_threads(None)
         one, folder = entry(name), out or Path("lyapnet_demo", name)
         report("closed loops, and a certificate of them")
         controller = one.load()

@@ -294,9 +294,9 @@ class TrainingConfig:
     beta2: float = setting(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
     weight_decay: float = setting(0.0, "AdamW weight decay.", at_least=0)
     precision: str = setting("float64", "Floating-point type of everything.", choices=("float64", "float32"))
-    threads: int = setting(
-        1,
-        "CPU threads; in networks this small, more of them mostly wait for each other.",
+    threads: int | None = setting(
+        None,
+        "CPU threads; null: compiled programs on all cores, or OMP_NUM_THREADS, and torch on one.",
         at_least=1,
         below=THREADS + 1,
     )

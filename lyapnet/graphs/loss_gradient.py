@@ -24,24 +24,27 @@ def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[.
         loss: a mean over the rows of its arguments.
         arguments: examples with the shapes and types of every call.
     """
-    trained, rows = trained_of(loss), len(arguments[0])
-    size = size_of_parts(rows, ROWS_PER_PART)
+    trained, size = trained_of(loss), size_of_parts(len(arguments[0]), ROWS_PER_PART)
     kernel = _kernel(loss, [column[:size] for column in arguments])
-
-    def by_kernel(kernel: NumberKernel, arguments: Sequence[Tensor]) -> list[Tensor]:
-        state, columns = state_of(loss), [column.split(size) for column in arguments]
-        parts = in_threads(lambda part: kernel(*state, *part), [*zip(*columns, strict=True)])
-        return [torch.stack(slopes).sum(0) * (size / rows) for slopes in zip(*parts, strict=True)]
 
     def differentiate(*arguments: Tensor) -> None:
         if kernel is None:
             gradient = torch.autograd.grad(loss(*arguments), trained, allow_unused=True)
         else:
-            gradient = by_kernel(kernel, arguments)
+            gradient = _mean_of_parts(kernel, state_of(loss), arguments, size)
         for parameter, slope in zip(trained, gradient, strict=True):
             parameter.grad = slope
 
     return differentiate
+
+
+def _mean_of_parts(
+    kernel: NumberKernel, state: Sequence[Tensor], arguments: Sequence[Tensor], size: int
+) -> list[Tensor]:
+    """The mean of a kernel's results over the parts of its arguments."""
+    parts = [*zip(*(column.split(size) for column in arguments), strict=True)]
+    results = in_threads(lambda part: kernel(*state, *part), parts)
+    return [torch.stack(each).mean(0) for each in zip(*results, strict=True)]
 
 
 def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None:

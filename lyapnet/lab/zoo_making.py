@@ -18,6 +18,7 @@ import torch
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_json, write_json
+from lyapnet.base.threads import use_threads
 from lyapnet.claims.certify import certify
 from lyapnet.claims.kinds import Statistical
 from lyapnet.controller.controller import Controller
@@ -140,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=ZOO, help="the folder")
     parser.add_argument("--after", action="store_true", help="only find again what follows T, without training")
     given = parser.parse_args(arguments)
-    torch.set_num_threads(1)
+    use_threads(1)
     for name in given.names or TASKS:
         if given.after:
             path = given.out / f"{name}.json"

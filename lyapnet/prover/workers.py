@@ -20,6 +20,7 @@ from torch.utils._pytree import tree_map_only
 
 from lyapnet.base.cluster import connected
 from lyapnet.base.errors import LyapnetError, UsageError, one_line
+from lyapnet.base.threads import use_threads
 from lyapnet.prover.boxes import Boxes
 
 Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
@@ -100,7 +101,7 @@ class ClusterWorker:
     """A worker on another machine."""
 
     def begin(self, make_question: Callable[[], Any], default: torch.dtype) -> None:
-        torch.set_num_threads(1)
+        use_threads(1)
         torch.set_default_dtype(default)
         _own[:] = [make_question()]
 
@@ -153,7 +154,7 @@ def _undecided_in_parallel(
 
 def _begin(question: Any) -> None:
     """Become a worker: one thread; leave signals to the parent process, and end with it."""
-    torch.set_num_threads(1)
+    use_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

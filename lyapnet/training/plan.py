@@ -10,10 +10,10 @@ from typing import Any
 
 import lightning as L
 import numpy as np
-import torch
 
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.sizes import check_training_sizes
+from lyapnet.base.threads import use_threads
 from lyapnet.controller.loading import config_of, load_value_function, require_parts
 from lyapnet.experiment.assembly import REGISTRIES, Parts, parts_of
 from lyapnet.experiment.assembly.target import named_entries
@@ -89,7 +89,7 @@ def plan_run(
     check_trainer_options(config)
     require_libraries(config.loggers)
     callbacks = build_callbacks(config)
-    torch.set_num_threads(config.training.threads)  # before compiling: code is cached by number of threads
+    use_threads(config.training.threads)
     parts = parts_of(config) if parts is None else parts
     require_parts(config, parts, config.experiment)
     module = build_module(config, parts)

@@ -6,11 +6,14 @@ import time
 import pytest
 import torch
 
-from lyapnet.base.threads import in_threads, seconds_of_work, size_of_parts
+from lyapnet.base import threads as module
+from lyapnet.base.threads import in_threads, seconds_of_work, size_of_parts, use_threads
 
 
 @pytest.fixture
 def threads(monkeypatch):
+    """Sets the number of threads that torch says it has."""
+    monkeypatch.setattr(module, "_of_programs", [])
     return lambda count: monkeypatch.setattr(torch, "get_num_threads", lambda: count)
 
 
@@ -75,3 +78,18 @@ def test_parts_are_equally_large():
         25,
         16,
     ]
+
+
+@pytest.mark.parametrize(("count", "of_torch", "of_programs"), [(None, 1, 3), (1, 1, 1), (2, 2, 2)])
+def test_by_default_programs_have_all_cores_and_torch_one(count, of_torch, of_programs, monkeypatch):
+    monkeypatch.setattr(module, "CORES", 3)
+    monkeypatch.setattr(module, "_of_programs", [])
+    before = torch.get_num_threads()
+    try:
+        use_threads(count)
+        assert torch.get_num_threads() == of_torch
+        at_once = threading.Barrier(of_programs, timeout=60)
+        found = in_threads(lambda k: at_once.wait() * 0 + threading.get_ident(), range(of_programs))
+        assert len({*found}) == of_programs
+    finally:
+        torch.set_num_threads(before)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
-import torch
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from lyapnet.base import threads as base_threads
 from lyapnet.base.types import State
 from lyapnet.lab.bench.accuracy import reference_gradient, relative_error
 from lyapnet.lab.bench.cases import Case
@@ -74,7 +74,7 @@ def _errors(gradients: Sequence[Tensor | None], case: Case, x0: State) -> list[f
 
 def use_threads(threads: int) -> None:
     """Compute on that many CPU threads; so does JAX, unless it has computed before."""
-    torch.set_num_threads(threads)
+    base_threads.use_threads(threads)
     os.environ["NPROC"] = str(threads)
 
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.files import read_file, write_json
 from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.threads import use_threads
 from lyapnet.base.types import State
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.loading import load
@@ -48,7 +49,7 @@ def run_job(job: Job, console: Console) -> Result:
         if (done := job.result) is not None:
             return done
         write_json(job.folder / RECORD, _description(job))
-        torch.set_num_threads(1)  # jobs run side by side
+        use_threads(1)  # jobs run side by side
         make = _lyapnet if job.method == OURS else _planner if job.method in PLANNED else _baseline
         result = make(job, console)
         result.write(job.folder / RESULT)

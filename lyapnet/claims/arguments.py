@@ -16,7 +16,7 @@ from lyapnet.task.noise import StateNoise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-COMPARED = 1000  # random states of X₀: their mean running cost sets δ, and their costs are compared with optima
+COMPARED = 1000  # number of random states of X₀ whose mean running cost sets δ and whose costs certificates compare
 
 
 def box_of(states: Any) -> Box | None:
@@ -32,11 +32,11 @@ def disturbance_of(disturbance: Mapping[str, float] | None, controller: Controll
     Raises:
         UsageError: a name is not the name of a state.
     """
-    w = of_states("a disturbance", disturbance or {}, controller)
+    w = number_of_each_state("a disturbance", disturbance or {}, controller)
     return torch.tensor(w, dtype=torch.float64) if disturbance else None
 
 
-def of_states(what: str, given: Mapping[str, float], controller: Controller) -> list[float]:
+def number_of_each_state(what: str, given: Mapping[str, float], controller: Controller) -> list[float]:
     """A number for each state, 0 for those that are not named.
 
     Raises:
@@ -50,11 +50,14 @@ def of_states(what: str, given: Mapping[str, float], controller: Controller) -> 
     return [given.get(name, 0.0) for name in names]
 
 
-def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tuple[ClosedLoop, Problem]:
-    """The closed loop and the task of a controller, with σ of the named states in the place of no noise.
+def with_noise(noise: Mapping[str, float] | None, controller: Controller) -> tuple[ClosedLoop, Problem]:
+    """The closed loop and the task of a controller, with noise of strength σ on the named states.
+
+    Args:
+        noise: σ by state, in its unit per √s; without it the result has the noise of the task.
 
     Raises:
-        UsageError: a name is not the name of a state, or the task has a noise of its own.
+        UsageError: a name is not the name of a state, or the task has noise already.
     """
     loop, problem = controller.closed_loop, controller.problem
     if not noise:
@@ -62,7 +65,7 @@ def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tu
     if problem.noise is not None:
         raise UsageError("Expected no noise beside that of the task, got some; leave it out.")
     loop = copied(loop)
-    loop.noise = StateNoise(of_states("noise", noise, controller), torch.float64)
+    loop.noise = StateNoise(number_of_each_state("noise", noise, controller), torch.float64)
     return loop, problem.replaced(noise=loop.noise)
 
 

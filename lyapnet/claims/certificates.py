@@ -24,7 +24,7 @@ class Certificate(ABC):
 
     Args:
         claim: the result: the numbers that were proved or sampled.
-        options: plain data, with the key `seed`.
+        options: the options of the claim and of the run as plain data, with the key `seed`.
     """
 
     kind: str

@@ -91,7 +91,7 @@ def certify(
 
 
 def _certify_two_sides(controller: Controller, above: Claim, given: LowerBound, run: Run) -> Certificate:
-    """Bound the cost of the controller from above, and the cost of any control from below."""
+    """Bound the cost of the controller from above, then the cost of any control from below."""
     below, options = given.beside(above), run.options(above, **{"two-sided": True}, **given.options_beside(above))
     below.require_fitting(controller)
     upper = above.establish(controller, run.share(above.share_of_two or 1.0))

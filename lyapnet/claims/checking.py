@@ -14,7 +14,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import plain
 from lyapnet.base.types import State
-from lyapnet.claims.arguments import under_noise
+from lyapnet.claims.arguments import with_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
@@ -34,7 +34,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.float_errors import FloatLaw
-from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
+from lyapnet.prover.kept_proofs import KeptProof, describe_condition, read_proofs, refuse_bad_file, select_proof
 from lyapnet.prover.proof import Progress
 from lyapnet.prover.readings import Readings, readings_from
 from lyapnet.task.sets import Box
@@ -111,7 +111,7 @@ def kind_of(path: Path) -> tuple[str, Reprove]:
         UsageError: there is no such file, or it is another.
     """
     proofs = read_proofs(path)
-    with refusing(path):
+    with refuse_bad_file(path):
         return KINDS[tuple(sorted(proofs))]
 
 
@@ -141,8 +141,8 @@ def kept_funnel(controller: Controller, path: Path) -> KeptSide:
 
 def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
     """As kept_funnel, for the proof of that name."""
-    content = part_of(read_proofs(path), name, path)
-    with refusing(path):
+    content = select_proof(read_proofs(path), name, path)
+    with refuse_bad_file(path):
         of = content["of"][0]
         readings = readings_from(of.get("readings"), controller.horizon.duration)
         last = None if readings is None else -1  # the last axis is the age of a reading
@@ -168,7 +168,9 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
         if isinstance(condition, SteppedPayment):
             domain = condition.domain_of(kept.states, torch.nonzero(kept.states.widths == 0).flatten().tolist())
         box = condition.search_box(domain)
-        KeptProof(path, about(bounded_condition(condition, domain, kept.degree), condition, *box), math.inf).claim(box)
+        KeptProof(
+            path, describe_condition(bounded_condition(condition, domain, kept.degree), condition, *box), math.inf
+        ).read_claim(box)
     return kept
 
 
@@ -239,8 +241,8 @@ def _reprove_region(controller: Controller, path: Path, budget: Budget, report: 
 
 
 def _reprove_noisy(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
-    content = part_of(read_proofs(path), "noisy", path)
-    with refusing(path):
+    content = select_proof(read_proofs(path), "noisy", path)
+    with refuse_bad_file(path):
         of, seconds = content["of"][0], float(content["seconds"])
         states = Box(*(torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper")))
         probability, alpha, delta = float(of["probability"]), float(of["alpha"]), float(of["delta"])
@@ -256,8 +258,8 @@ def _reprove_noisy(controller: Controller, path: Path, budget: Budget, report: R
 
 
 def _reprove_reach(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
-    content = part_of(read_proofs(path), "reach", path)
-    with refusing(path):
+    content = select_proof(read_proofs(path), "reach", path)
+    with refuse_bad_file(path):
         of, seconds = content["of"][0], float(content["seconds"])
         states = Box(*(torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper")))
         target, *avoided = (
@@ -267,7 +269,7 @@ def _reprove_reach(controller: Controller, path: Path, budget: Budget, report: R
         noise = None if of["noise"] is None else {str(name): float(sigma) for name, sigma in of["noise"].items()}
         if of["degree"] != 2 or not 0 < probability < 1:
             raise ValueError("forms of unknown degree, or no probability")
-    loop, problem = under_noise(noise, controller)
+    loop, problem = with_noise(noise, controller)
     claim = prove_reach(
         loop, problem, target, avoided, probability, risk, rate, states, budget, _generator(), report, path, True,
         noise,

@@ -35,10 +35,10 @@ def option(
     flag: str | None = "",
     metavar: str | None = None,
 ) -> Any:
-    """A field of a claim, with its description and the finite numbers that it allows.
+    """A field of a claim, with its description and its range of finite numbers.
 
     Args:
-        remedy: advice in the error message for a number that is not allowed.
+        remedy: advice in the error message for a number outside the range.
         check: raises a UsageError for a value that is not allowed; not called for None.
         flag: the name on the command line; the name of the field if empty; None for a field without one.
         metavar: the placeholder of the value in the help text.
@@ -163,19 +163,12 @@ class Claim(ABC):
     """
 
     kind: ClassVar[str]  # its name in certificates and reports
-    means: ClassVar[Sequence[str]] = (
-        "seconds",
-        "workers",
-        "device",
-        "ray",
-        "keep",
-    )  # the resources of a run that it can use
-    allows_noise: ClassVar[bool] = False  # whether it is a claim about closed loops under noise too
-    allows_reference: ClassVar[bool] = False  # whether the goal may move with the time on a reference
+    means: ClassVar[Sequence[str]] = ("seconds", "workers", "device", "ray", "keep")  # resources of a run that it uses
+    allows_noise: ClassVar[bool] = False  # whether the task may have noise
+    allows_reference: ClassVar[bool] = False  # whether the goal may move along a reference
     allows_any_dynamics: ClassVar[bool] = False  # whether the system need not be control-affine
-    share_of_two: ClassVar[float | None] = (
-        None  # of the seconds, if a bound from below follows; None if the claim bounds no cost
-    )
+    share_of_two: ClassVar[float | None] = None
+    """Share of the seconds, if a bound of the cost from below follows; None if the claim bounds no cost from above."""
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):
@@ -184,11 +177,11 @@ class Claim(ABC):
             if check is not None and value is not None:
                 check(value)
 
-    def require_law(self, controller: "Controller") -> None:  # noqa: B027, most claims need nothing of it
-        """Refuse a control law that no claim of this kind can bound, before anything is computed.
+    def require_law(self, controller: "Controller") -> None:  # noqa: B027, most claims take any law
+        """Refuse a control law that claims of this kind cannot bound, before anything is computed.
 
         Raises:
-            UsageError: the cost of the controls or their set is none that it takes.
+            UsageError: this kind does not cover the cost of the controls or their set.
         """
 
     @abstractmethod
@@ -221,7 +214,7 @@ def check_reading(value: Any) -> None:
 
 
 READ_AT = ("continuous", "held", "steps")
-"""When u is read: at every t; at times at most Δt apart, and held between them; or in each step of the model."""
+"""When u is read: at every t; at certain times, and held in between; or at each step of the model, and held over it."""
 
 
 def check_errors(value: Any) -> None:
@@ -331,7 +324,7 @@ def sides_of(states: Any) -> tuple[list[float], list[float]]:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadAtTimes(Claim):
-    """A claim about u read at every t, or at times and held between them, with a delay and errors."""
+    """A claim about a law that is read at every t; or at certain times and held in between, with a delay and errors."""
 
     time: str | None = option(
         None, "When u is read: continuous, at every t; held, each Δt; or steps, a claim about steps of the model.",

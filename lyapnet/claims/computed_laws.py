@@ -1,4 +1,4 @@
-"""Claims about a law that a program computes in floating-point numbers: its errors where it is read."""
+"""Claims about a law that a program computes in floating-point numbers: the errors of the program."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,25 +6,25 @@ from dataclasses import replace
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.prover.float_errors import WIDE, FloatLaw
+from lyapnet.prover.float_errors import UNBOUNDED_STATE_LIMIT, FloatLaw
 from lyapnet.prover.readings import Readings
 from lyapnet.task.sets import Box
 
 
-def computed_by(
+def add_program_errors(
     law: FloatLaw | None, readings: Readings | None, states: Box, left_out: Sequence[int]
 ) -> Readings | None:
-    """Readings of a law that a program computes: its errors where D is measured are added to those of the controls.
+    """The readings with the program's errors, for all measured states of D, added to the errors of the controls.
 
-    Readings of a kept proof have them already; they are bounded again.
+    Readings of a kept proof contain these errors already; the program is bounded again, and must not exceed them.
 
     Args:
-        law: None for a law in real numbers.
+        law: the program; None for a law in real numbers.
         states: D.
-        left_out: states that D does not bound, as nothing depends on them; they are within ±WIDE.
+        left_out: states on which nothing depends; D does not bound them, and |x_i| ≤ UNBOUNDED_STATE_LIMIT is assumed.
 
     Raises:
-        UsageError: the proof is about another file; or as FloatLaw.errors.
+        UsageError: the proof is about another program, or with smaller errors; or as FloatLaw.errors.
     """
     kept = None if readings is None else readings.computed
     if readings is None or (law is None and kept is None):
@@ -37,7 +37,7 @@ def computed_by(
             "export."
         )
     e = torch.tensor(readings.errors, dtype=torch.float64)
-    e[list(left_out)] = WIDE
+    e[list(left_out)] = UNBOUNDED_STATE_LIMIT
     found = law.computed_on((states.lower - e, states.upper + e))
     if kept is None:
         more = tuple(a + b for a, b in zip(readings.control_errors, found.errors, strict=True))

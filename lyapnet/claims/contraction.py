@@ -16,7 +16,7 @@ from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.claims.preconditions import append_constants, at_time, first_states, over_time
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
-from lyapnet.prover.boxes import pieces
+from lyapnet.prover.boxes import divide_box
 from lyapnet.prover.branch_and_bound import Budget, minimum
 from lyapnet.prover.branches import decisions
 from lyapnet.prover.rounding import rounding
@@ -24,24 +24,27 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import gradients
 
-BOXES, SAMPLES = 2000, 200  # for one size of the box: boxes to bound at most, and states to test before
-GROWTH, SIZES = 1.6, 20  # ratio of two neighbouring sizes of the box, and their number; the largest is half of D
-NEAR = 1e-6  # largest ‖YZ − 1‖ of an inverse Z; it enters the bounds as a factor 1 + NEAR
-LEAST = 0.2  # required share of the linearised law's own rate; but at most half of the rate at the goal is required
-CORNERS = 6  # the law is linearised at the corners of P along so many axes at most
-NESTED, CLOSER = 10, 0.9  # number of nested balls at most; a further one has to be smaller by this factor
-PIECES = 256  # pieces into which the box around a ball is cut, about
-LITTLE = 1e-12  # no ball inside one of this radius is computed
+BOXES, SAMPLES = 2000, 200  # for each size of B: largest number of bounded boxes, and of states that are tested first
+GROWTH, SIZES = 1.6, 20  # ratio of two neighbouring sizes of B, and their number; the largest is half of D
+NEAR = 1e-6  # bound of ‖YZ − 1‖ for a computed inverse Z; it enters the bounds as a factor 1 + NEAR
+LEAST_SHARE_OF_RATE = (
+    0.2  # required rate as a share of that of the linearised law; at most half of the rate at the goal
+)
+CORNERS = 6  # largest number of axes of P at whose corners the law is linearised
+MOST_BALLS, NEXT_BALL = 10, 0.9  # largest number of nested balls, and ratio of radii below which a next one is tried
+PIECES = 256  # number of boxes, about, into which the box around a ball is cut
+SMALLEST_BALL = 1e-12  # radius below which no further ball is tried
 
 
 @dataclass(frozen=True)
 class Contraction:
-    """With F(x) = f(x) + g(x)u(0, x), continuous on a box B around x*, J its Jacobian and P = YᵀY:
+    """F(x) = f(x) + g(x)u(0, x) is continuous on a box B around x*, and with its Jacobian J and P = YᵀY
 
         ½(P J(x) + J(x)ᵀP) ≤ −κP   almost everywhere on B.
 
-    By the mean value theorem on the segment between them, ‖Y(x − x')‖ falls at the rate κ for any two closed loops in
-    B. Those of a set that none leaves therefore converge to one equilibrium x_e in B, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
+    By the mean value theorem on the segment between two closed loops x and x' in B, ‖Y(x − x')‖ falls at the rate κ.
+    So all closed loops in a subset of B that none of them leaves converge to one equilibrium x_e in B, and
+    ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
 
     For steps x⁺ = x + Δt F(x), F is the mean rate of a step, and
 
@@ -49,8 +52,8 @@ class Contraction:
 
     so that ‖Y(x − x')‖ falls by the factor 1 − κΔt in each step: with M = YJY⁻¹, ‖1 + ΔtM‖² ≤ 1 − 2κΔt ≤ (1 − κΔt)².
 
-    For plants ẋ = F(x; p), p ∈ P, the inequality holds for every p with the same Y. Each plant has its own equilibrium
-    x_e(p), and the bound uses the largest ‖Y F(x*; p)‖.
+    For several plants ẋ = F(x; p), the inequality holds for every p with the same Y. Each plant has its own equilibrium
+    x_e(p), and the bound of ‖x_e − x*‖ uses the largest ‖Y F(x*; p)‖.
 
     Source: Lohmiller, Slotine, "On contraction analysis for non-linear systems", Automatica 1998.
     """
@@ -63,15 +66,15 @@ class Contraction:
 
 
 def rate_of(loop: ClosedLoop, steps: Problem | None, x: State, u: Control) -> State:
-    """f + gu; or its mean over one step with u held."""
+    """f + gu, or the mean of ẋ over one step with u held."""
     return loop.system.dynamics(x, u) if steps is None else steps.smooth_rates(x, u)[0]
 
 
 class _Law:
-    """F(x) in real arithmetic. At one x it runs the traced operations, to be differentiated; on a batch, the code.
+    """F(x) in real arithmetic: for one x its traced operations, which can be differentiated; for a batch its code.
 
     Args:
-        steps: gives the steps of which F is the mean rate; None: F = f + gu.
+        steps: the problem whose steps F is the mean rate of; None: F = f + gu.
     """
 
     def __init__(self, loop: ClosedLoop, states: Box, steps: Problem | None):
@@ -82,7 +85,7 @@ class _Law:
         self.decisions = None if branches is None else BoundedFunction(branches, self.domain)
 
     def is_continuous_on(self, box: Box) -> bool:
-        """Whether every comparison and every sign in F is constant on a box; all other operations are continuous."""
+        """Whether F is continuous on a box: each comparison and sign in it is constant, the rest is continuous."""
         if self.decisions is None:
             return True
         bounds = self.decisions.bounds(*at_time(0.0, box.lower, box.upper))
@@ -100,7 +103,7 @@ class _Law:
         return torch.stack(rows, -2)
 
     def linearised(self, goal: State, states: Box, seen: Sequence[int]) -> list[np.ndarray]:
-        """The Jacobian at the goal; with parameters, that in the middle of P and those at its corners."""
+        """The Jacobian at the goal; for several plants, in the middle of P and at its corners."""
         n = len(goal) - len(self.constants)
         corners = append_constants(Box(goal[:n], goal[:n]), states).corners(CORNERS)
         at = [goal] if not self.constants else [goal, *corners]
@@ -108,7 +111,7 @@ class _Law:
 
 
 class _Coordinates:
-    """Coordinates Y in which a law is to contract at least at the rate `least`, and bounds of its rate there.
+    """Coordinates Y, and bounds of the rate at which a law contracts in them; a rate of `least` is required.
 
     Raises:
         LinAlgError: as _inverse.
@@ -122,8 +125,8 @@ class _Coordinates:
     def rate(self, t: Time, x: State) -> PerState:
         """A lower bound of the least eigenvalue of S = −½Zᵀ(PJ + JᵀP + ΔtJᵀPJ)Z, where Z ≈ Y⁻¹.
 
-        It uses Gershgorin's discs. For several plants, where Y cannot make every S diagonal, it also uses Brauer's
-        ovals, which are tighter.
+        It uses Gershgorin's discs. For several plants, as Y cannot make every S diagonal, it also uses Brauer's ovals,
+        which are tighter.
         """
         N = self.Y @ (self.law.jacobian(t, x, self.seen) @ self.Z)
         M, rows = self.Z.mT @ (self.Y.mT @ N), range(len(self.seen))
@@ -159,7 +162,7 @@ class _Coordinates:
         """A bound of ‖Y F(x*)‖ / (κσ), where σ is the least singular value of Y."""
         n = self.states.dimension - len(self.law.constants)
         at_goal = over_time(append_constants(Box(self.goal[:n], self.goal[:n]), self.states), 0.0)
-        plants = pieces(*at_goal, [1 + i for i in self.law.constants])
+        plants = divide_box(*at_goal, [1 + i for i in self.law.constants])
         ((low, high),) = self.law.bounded.bounds(*plants)
         size = torch.maximum(low.abs(), high.abs())[:, list(self.seen)]
         largest = float(torch.linalg.vector_norm(size @ self.Y.abs().mT, dim=-1).max())
@@ -183,19 +186,19 @@ def contraction_around(
     proposed: tuple[Box, Tensor] | None = None,
     steps: Problem | None = None,
 ) -> tuple[Contraction | None, float]:
-    """Find the largest box around the goal on which the law contracts, among boxes in the shape of D.
+    """Find the largest box around the goal on which the law contracts, among scaled copies of D.
 
     Args:
-        goal, states: x* and D; for several plants, followed by the middle of P and by P.
+        goal, states: x* and D; for several plants, with the middle of P and with P as further components.
         seen: the indices of the states that the law depends on, without constants.
         seconds: the time limit.
         proposed: the only (B, Y) to test, for example from a file; the test assumes nothing about them.
-        steps: gives the steps that are to contract, with u held; None: continuous time.
+        steps: the problem whose steps are to contract, with u held; None: continuous time.
 
     Returns:
         (contraction, slowest): the contraction, or None if the linearised law is unstable or contracts on no tested
         box; and the largest Re μ + ½Δt|μ|² among the eigenvalues μ of the linearised law, in 1/s, with Δt = 0 in
-        continuous time. Steps with |1 + Δtμ| < 1 have a negative one.
+        continuous time. It is negative if the law is stable: for steps, if |1 + Δtμ| < 1 for each μ.
     """
     law, reach, budget = (
         _Law(loop, states, steps),
@@ -203,16 +206,16 @@ def contraction_around(
         Budget(seconds),
     )
     A, *others = law.linearised(goal, states, seen)
-    slowest = float(np.max([_slowest(each, law.dt) for each in (A, *others)]))  # nan if one of them is nan
-    own, found = -slowest / 2, None
-    if not own > 0:
+    slowest = float(np.max([_slowest_rate(each, law.dt) for each in (A, *others)]))  # nan if one of them is nan
+    own_rate, found = -slowest / 2, None
+    if not own_rate > 0:
         return None, slowest
     scale = reach[list(seen)].numpy()
     try:
-        metrics = [] if proposed else _candidate_metrics(law, A, goal, seen, scale, own)
+        metrics = [] if proposed else _candidate_metrics(law, A, goal, seen, scale, own_rate)
         Ys = [proposed[1]] if proposed else [_coordinates_of(P, A, scale, law.dt) for P in metrics]
         at_goal, Y = max(((_rate_of_linear_laws(Y, (A, *others), law.dt), Y) for Y in Ys), key=itemgetter(0))
-        coordinates = _Coordinates(law, goal, states, seen, Y, min(LEAST * own, at_goal / 2))
+        coordinates = _Coordinates(law, goal, states, seen, Y, min(LEAST_SHARE_OF_RATE * own_rate, at_goal / 2))
     except np.linalg.LinAlgError:
         return None, slowest
     n = len(goal) - len(loop.system.constants)
@@ -220,7 +223,7 @@ def contraction_around(
     goal, within = goal[:n], first_states(states, n)
     if proposed is not None:
         box = proposed[0]
-        fits = _is_around(box, goal, within, radii * GROWTH**-SIZES)
+        fits = _is_box_around(box, goal, within, radii * GROWTH**-SIZES)
         return coordinates.on(box, budget.left) if fits and at_goal > 0 else None, slowest
     low, high = -1, SIZES if at_goal > 0 else 0  # contraction is proved for size low, and not for size high
     while high - low > 1:
@@ -231,7 +234,7 @@ def contraction_around(
     return found, slowest
 
 
-def distance_left(
+def final_distance(
     loop: ClosedLoop,
     around: Contraction,
     goal: State,
@@ -239,16 +242,16 @@ def distance_left(
     seen: Sequence[int],
     steps: Problem | None = None,
 ) -> float:
-    """An upper bound of the distance from the goal as t → ∞, where u is rounded: ẋ = F̂(x) instead of F(x).
+    """An upper bound of the distance from the goal as t → ∞ if u is rounded, so that ẋ = F̂(x) instead of F(x).
 
-    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖; for steps, their difference quotient is so bounded. As t → ∞
-    the closed loop therefore comes into the ball of radius R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The
-    supremum over a box around that ball gives a smaller ball, and so on. The bound is R/σ plus the distance of x_e,
-    where σ is the least singular value of Y.
+    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖; for steps, the same bounds the difference quotient. As t → ∞
+    the closed loop therefore comes into the ball ‖Y(x − x_e)‖ ≤ R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The
+    supremum over a box around that ball gives a smaller ball, and so on. The bound is R/σ plus the distance of x_e from
+    the goal, where σ is the least singular value of Y.
 
     Args:
-        around: the contraction of F; B holds a set that no closed loop of F̂ leaves.
-        goal, states, seen, steps: as of contraction_around.
+        around: the contraction of F; B contains a set that no closed loop of F̂ leaves.
+        goal, states, seen, steps: as in contraction_around.
     """
 
     def error(t: Time, x: State) -> tuple[State]:
@@ -260,15 +263,15 @@ def distance_left(
     chosen, box, radius = list(seen), around.box, math.inf
     of_ball = torch.linalg.vector_norm(_inverse(Y, len(seen)), dim=-1)
     axes = [1 + i for i in (*seen, *loop.system.constants)]
-    for _ in range(NESTED):
+    for _ in range(MOST_BALLS):
         whole = append_constants(box, states)
-        ((low, high),) = bounded.bounds(*pieces(*over_time(whole, 0.0), axes, PIECES))
+        ((low, high),) = bounded.bounds(*divide_box(*over_time(whole, 0.0), axes, PIECES))
         size = torch.maximum(low.abs(), high.abs())[:, chosen] @ Y.abs().mT
         found = float(torch.linalg.vector_norm(size, dim=-1).max()) / around.rate * (1 + NEAR)
-        if not found < CLOSER * radius:
+        if not found < NEXT_BALL * radius:
             break
         radius = found
-        if radius < LITTLE:
+        if radius < SMALLEST_BALL:
             break
         reach = torch.zeros(n, dtype=goal.dtype)
         reach[chosen] = (of_ball * radius + around.offset) * (1 + NEAR)
@@ -278,7 +281,7 @@ def distance_left(
     return min(left, float(torch.linalg.vector_norm(around.box.reach_from(goal[:n]))))
 
 
-def _slowest(A: np.ndarray, dt: float) -> float:
+def _slowest_rate(A: np.ndarray, dt: float) -> float:
     """The largest Re μ + ½Δt|μ|² among the eigenvalues μ; nan if A is not finite."""
     if not np.isfinite(A).all():
         return math.nan
@@ -286,10 +289,8 @@ def _slowest(A: np.ndarray, dt: float) -> float:
     return float((mu.real + dt / 2 * np.abs(mu) ** 2).max())
 
 
-def _is_around(box: Box, goal: State, states: Box, least: State) -> bool:
-    """Whether a box lies in D and reaches at least `least` from the goal on each side; along axes of least = 0, it must
-    have width 0.
-    """
+def _is_box_around(box: Box, goal: State, states: Box, least: State) -> bool:
+    """Whether a box lies in D and extends at least by `least` from the goal; along axes with least = 0, not at all."""
     if box.lower.shape != goal.shape:
         return False
     within, room = (states.lower <= box.lower) & (box.upper <= states.upper), (goal - box.lower, box.upper - goal)
@@ -297,11 +298,12 @@ def _is_around(box: Box, goal: State, states: Box, least: State) -> bool:
 
 
 def _candidate_metrics(
-    law: _Law, A: np.ndarray, goal: State, seen: Sequence[int], scale: np.ndarray, own: float
+    law: _Law, A: np.ndarray, goal: State, seen: Sequence[int], scale: np.ndarray, own_rate: float
 ) -> list[np.ndarray]:
-    """Candidates for P, in states divided by scale: the linear law A contracts in the first one at least at the rate
-    `own`, if its eigenvalues have real parts below −own. For several plants V_xx is another candidate, since a good V
-    falls for all of them.
+    """Candidates for P, in states divided by scale.
+
+    In the first one the linear law A contracts at least at `own_rate`, if its eigenvalues have real parts below
+    −own_rate. For several plants V_xx is another candidate, since a good V falls for all of them.
 
     Raises:
         LinAlgError: A is not finite in this scale.
@@ -309,13 +311,13 @@ def _candidate_metrics(
     scaled, eye = A * scale / scale[:, None], np.eye(len(A))
     if not np.isfinite(scaled).all():
         raise np.linalg.LinAlgError("Expected a finite linearised law in units of D, got infinite entries.")
-    with warnings.catch_warnings():  # about rounding: each P is tested before it is used
+    with warnings.catch_warnings():  # warnings about rounding do not matter: each P is tested before it is used
         warnings.simplefilter("ignore")
         if law.dt:
-            step = (eye + law.dt * scaled) / math.sqrt(1 - 2 * own * law.dt)
+            step = (eye + law.dt * scaled) / math.sqrt(1 - 2 * own_rate * law.dt)
             found = [solve_discrete_lyapunov(step.T, law.dt * eye)]
         else:
-            found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
+            found = [solve_continuous_lyapunov((scaled + own_rate * eye).T, -eye)]
     if law.constants and law.loop.V is not None:
         t, V, chosen = goal.new_zeros(()), law.loop.V, list(seen)
         H = torch.autograd.functional.hessian(lambda x: V(t, x), goal)[chosen][:, chosen].numpy()  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -348,7 +350,7 @@ def _rate_of_linear_laws(Y: Tensor, laws: Sequence[np.ndarray], dt: float) -> fl
 
 
 def _inverse(Y: Tensor, k: int) -> Tensor:
-    """Z with ‖YZ − 1‖ < NEAR/10; the test counts the rounding of the product.
+    """Z with ‖YZ − 1‖ < NEAR/10; the test includes the rounding of the product.
 
     Raises:
         LinAlgError: Y has no such inverse, or another shape.

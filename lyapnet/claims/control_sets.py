@@ -1,4 +1,4 @@
-"""Checks of u(t, x) before a proof: u ∈ U for a control set of a user's own, and u as the minimiser of its costs."""
+"""Checks of u(t, x) before a proof: u ∈ U for a user's control set, and u as the minimiser of its cost."""
 
 import logging
 import operator
@@ -17,8 +17,8 @@ from lyapnet.base.types import Corner
 from lyapnet.graphs.tracing import name_of, trace
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
-from lyapnet.prover.boxes import Boxes, roots
-from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, searched
+from lyapnet.prover.boxes import Boxes, root_boxes
+from lyapnet.prover.branch_and_bound import Budget, Question, choose_axis, run_search
 from lyapnet.prover.minima import BACKWARD, is_minimum
 from lyapnet.prover.taylor import interval_form
 from lyapnet.task.ball import ControlBall
@@ -27,10 +27,11 @@ from lyapnet.task.cost.minimum import description, is_quadratic_between_limits
 from lyapnet.task.sets import about_control
 from lyapnet.value.policy import HJBPolicy, SampledPolicy, ValuePolicy
 
-POINTS, DESCENTS = 20_000, 20  # where u ∈ U is not proved: points to test, and descent steps from the worst of them
-MINIMA = 5000  # points at which u is tested as a minimum
-ROUNDING = 1e-6  # of the largest |u|: how far u may lie outside of U
-BOXES, SECONDS = 2000, 20.0  # limits of the proof
+POINTS, DESCENTS = 20_000, 20  # number of points at which u ∈ U is tested, and of descent steps from the worst of them
+STARTS = 256  # number of these worst points
+MINIMA = 5000  # number of points at which u is tested as a minimiser
+ROUNDING = 1e-6  # largest distance of u from U that counts as rounding, relative to the largest |u|
+BOXES, SECONDS = 2000, 20.0  # limits of the proof that u ∈ U
 ASSUMED = "That u stays in U was tested at {} points of [0, T] × D, and is not proved: bounds cannot decide it for {}."
 
 MINIMISED = (
@@ -40,14 +41,13 @@ MINIMISED = (
 
 
 def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
-    """Refuse a law that leaves a control set U of the user somewhere in a box of (t, x).
+    """Refuse a law that leaves a user's control set U somewhere in a box of (t, x).
 
-    The comparisons of `contains` are bounded on boxes, like the condition. If these bounds decide nothing, for example
-    because u reaches the boundary of a disk, the comparisons are tested at random points and along gradient descents
-    from the worst of them.
+    The comparisons in `contains` are tested at random points and along gradient descents from the worst of them, and
+    bounded on boxes. Bounds may decide nothing, for example if u reaches the boundary of a disk.
 
     Returns:
-        A sentence for the claim that says what is assumed of u; empty if u ∈ U is proved, or U is built in.
+        A sentence for the claim that says what is assumed of u; empty if u ∈ U is proved, or U is one of lyapnet's.
 
     Raises:
         UsageError: u leaves U; or `contains` cannot be traced.
@@ -72,7 +72,7 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
             question = _Inside(margin, None, room)
         else:
             budget = Budget(SECONDS, boxes=BOXES)
-            proved = not len(searched(question, roots(lower[None], upper[None]), budget).frontier.key)
+            proved = not len(run_search(question, root_boxes(lower[None], upper[None]), budget).frontier.key)
         question.look(_descend(margin, points, lower, upper))
         outside, proved = question.outside, proved and not len(question.outside)
     if len(outside):
@@ -90,7 +90,7 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
 
 
 def require_written_law(loop: ClosedLoop, claim: str) -> None:
-    """Refuse a law that minimises another cost than uᵀRu, or in a ball, for a claim whose bounds read u as written.
+    """Refuse a law whose u is no closed form (see `reads_as_written`), for a claim that bounds the operations of u.
 
     Args:
         claim: the kind of the certificate, for the message.
@@ -108,14 +108,14 @@ def require_written_law(loop: ClosedLoop, claim: str) -> None:
 
 
 def reads_as_written(policy: ValuePolicy) -> bool:
-    """Whether u is written in a closed form: of uᵀRu between limits, or of a single control that pays |u|."""
+    """Whether the code of u is a closed form: for the cost uᵀRu between limits, or one control with a cost |u|."""
     if is_quadratic_between_limits(policy.cost.nonquadratic, policy.controls):
         return True
     return policy.system.m == 1 and _pays_absolute_values(policy) and not isinstance(policy.controls, ControlBall)
 
 
 def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
-    """Refuse a law whose control bounds do not know as a minimum, nor as it is written.
+    """Refuse a law whose u is neither a closed form nor a minimiser that lyapnet.prover.minima can bound.
 
     Raises:
         UsageError: the message names the costs and the set, and the law.
@@ -146,7 +146,7 @@ def require_known_minimum(loop: ClosedLoop, claim: str) -> None:
 
 
 def _pays_absolute_values(policy: ValuePolicy) -> bool:
-    """Whether controls pay |u| beside uᵀRu, or nothing."""
+    """Whether all costs of controls beside uᵀRu are absolute values w|u|."""
     return all(type(cost) is AbsoluteCost for cost in _costs_of_controls(policy))
 
 
@@ -163,13 +163,13 @@ def _in_words(policy: ValuePolicy) -> str:
 
 
 def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
-    """Refuse a law that is not the minimum that bounds take it for, at random points of a box of (t, x).
+    """Test at random points of a box of (t, x) that u is the minimiser that bounds take it for.
 
     Returns:
-        A sentence for the claim that says what is assumed of u; empty if bounds read u as it is written.
+        A sentence for the claim that says what is assumed of u; empty if u is a closed form.
 
     Raises:
-        UsageError: at a point u is farther from it than bounds allow for.
+        UsageError: at a point u is farther from the minimiser than bounds allow for.
     """
     policy, points = loop.policy, _random_points(domain, MINIMA)
     if not isinstance(policy, ValuePolicy):
@@ -198,23 +198,21 @@ def _random_points(domain: tuple[Corner, Corner], count: int) -> Tensor:
 
 @dataclass
 class _Inside(Question):
-    """Whether a margin is at least −room on boxes, by Taylor forms or by intervals, whichever bound is tighter.
+    """Whether margins are at least −room on boxes; each is bounded by a Taylor form and by an interval.
 
     Intervals are exact at the limits of a clamped control.
     """
 
-    margin: Callable[[Tensor, Tensor], Tensor]
-    bounded: BoundedFunction | None
+    margin: Callable[[Tensor, Tensor], Tensor]  # (t, x) ↦ margins
+    bounded: BoundedFunction | None  # of the margins
     room: float
-    outside: Tensor = field(
-        default_factory=lambda: torch.zeros(0, 0)
-    )  # (t, x) with a smaller margin: one row if one was found, else none
+    outside: Tensor = field(default_factory=lambda: torch.zeros(0, 0))  # one (t, x) with a smaller margin, or none
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         return len(self.outside) > 0
 
-    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+    def find_undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         assert self.bounded is not None
         forms = self.bounded.forms(boxes.lower, boxes.upper)
         plain = self.bounded.image(interval_form(boxes.lower, boxes.upper))
@@ -222,17 +220,17 @@ class _Inside(Question):
         boxes, worst = boxes._replace(key=low.amin(0)), int(low.amin(1).argmin())
         chosen = ~(boxes.key >= -self.room)
         self.look(boxes.center[chosen])
-        return boxes[chosen], axis_to_cut(self.bounded, forms[worst], boxes, chosen, worst)
+        return boxes[chosen], choose_axis(self.bounded, forms[worst], boxes, chosen, worst)
 
     def look(self, points: Tensor) -> None:
-        """Keep the first of some points whose margin is too small."""
-        if len(points) and not self.settled:
+        """Look for a point at which a margin is too small, and keep the first one."""
+        if len(points) and not self.is_settled:
             with torch.no_grad():
                 self.outside = points[(self.margin(points[:, 0], points[:, 1:]) < -self.room).any(-1)][:1]
 
 
 def _margin(policy: ValuePolicy) -> Callable[[Tensor, Tensor], Tensor] | None:
-    """(t, x) ↦ the margins of the comparisons in `contains(u)`, all of which must be ≥ 0, (*batch, comparisons).
+    """(t, x) ↦ the margins, (*batch, comparisons), of the comparisons in contains(u(t, x)); all are ≥ 0 if u ∈ U.
 
     None if `contains` is not a conjunction of comparisons.
     """
@@ -257,9 +255,9 @@ def _margin(policy: ValuePolicy) -> Callable[[Tensor, Tensor], Tensor] | None:
 
 
 def _margins_of(graph: GraphModule, u: Tensor) -> Tensor:
-    """Run a graph with the margin of each comparison instead of its truth value: below 0 where it is false.
+    """Run a graph with a margin instead of the truth value of each comparison, which is false where the margin is < 0.
 
-    The margins of a conjunction are joined into one vector, since bounds of their minimum would be less tight.
+    The margins of a conjunction form a vector, since bounds of their minimum would be less tight.
 
     Raises:
         NotImplementedError: the graph uses a truth value in another way.
@@ -300,7 +298,7 @@ def _unequal(a: Tensor, b: Any) -> Tensor:
 
 
 def _finite(value: Tensor) -> Tensor:
-    return 1 + 0 * value  # every bounded value is finite
+    return 1 + 0 * value  # a value with bounds is finite
 
 
 # operator with a boolean result ↦ its margin; operators that rearrange booleans rearrange their margins
@@ -314,9 +312,9 @@ MARGINS: dict[str, Callable[..., Tensor]] = {
 
 
 def _descend(margin: Callable[[Tensor, Tensor], Tensor], points: Tensor, lower: Corner, upper: Corner) -> Tensor:
-    """The ends of gradient descents on the least margin, from the points where it is smallest."""
+    """The ends of gradient descents of the least margin, from the points where it is smallest."""
     with torch.no_grad():
-        least = margin(points[:, 0], points[:, 1:]).amin(-1).argsort()[:256]
+        least = margin(points[:, 0], points[:, 1:]).amin(-1).argsort()[:STARTS]
     at, width = points[least], upper - lower
     for k in range(DESCENTS):
         leaf = at.clone().requires_grad_()

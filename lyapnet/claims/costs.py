@@ -18,14 +18,14 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 
-SEARCHED = 64  # states at most for an oracle that solves an optimal control problem for each
+MOST_SOLVED = 64  # largest number of states for which an oracle solves an optimal control problem each
 
 
 class Inside(NamedTuple):
     """States of X₀ for which bounds of the cost are proved, with V(0, x₀) and these bounds."""
 
     x0: State
-    value: PerState
+    value: PerState  # V(0, x₀)
     guaranteed: PerState  # upper bound of the cost
     low: PerState | None = None  # lower bound of the cost, if one is proved
 
@@ -84,7 +84,7 @@ class CostCertificate(Certificate):
 def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> Tensor | None:
     """The optimal costs of the first of some states; None without states, without an oracle, or if time runs out.
 
-    IPOPT solves only the first SEARCHED states, starting from the controller's trajectories.
+    IPOPT solves only the first MOST_SOLVED states, starting from the controller's trajectories.
     """
     end = time.monotonic() + seconds
 
@@ -96,7 +96,7 @@ def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> T
         return None
     try:
         oracle = oracle_of(controller.problem, controller.method)
-        some = x0 if isinstance(oracle, RiccatiOracle) else x0[:SEARCHED]
+        some = x0 if isinstance(oracle, RiccatiOracle) else x0[:MOST_SOLVED]
         return oracle.solve(some, controller.closed_loops(some).u, in_time).cost.double()
     except OracleError:
         return None

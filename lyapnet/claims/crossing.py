@@ -1,4 +1,4 @@
-"""State constraints: the level of V below which no closed loop violates one, and closed loops that do."""
+"""State constraints: the level of V below which no closed loop violates one, and a search for closed loops that do."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,9 +18,9 @@ from lyapnet.task.constraints import Constraints, names_of
 from lyapnet.task.problem import Problem
 from lyapnet.value.calculus import gradients
 
-SHELL = 1e-2  # {h = 0} is bounded as part of {0 ≤ h ≤ SHELL}, which has a volume
-LOOPS, FINER = 1000, 4  # simulated closed loops, and their steps in each Δt
-SURE = 1e-6  # a larger h is a violation, not an error of the simulation
+SHELL = 1e-2  # the surface {h = 0} is replaced by {0 ≤ h ≤ SHELL}, which boxes can cover
+SIMULATED_LOOPS, SUBSTEPS = 1000, 4  # number of simulated closed loops, and of their steps in each Δt
+LEAST_VIOLATION = 1e-6  # h above which a simulated closed loop violates a constraint; smaller ones may be its errors
 
 
 class Violation(NamedTuple):
@@ -33,10 +33,10 @@ class Violation(NamedTuple):
 
 
 def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], budget: Budget, enough: float) -> float:
-    """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ where that is empty.
+    """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ if this set is empty.
 
     A closed loop that starts with h ≤ 0 and whose W stays below this bound keeps h ≤ 0: if some h_j became positive,
-    then h_j = 0 and ḣ_j ≥ 0 at the last time before with h_j = 0.
+    then at the last time before with h_j = 0 the loop would be in this set.
 
     Args:
         enough: the search stops when the bound is at least this level.
@@ -57,7 +57,7 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
     loop, (lower, upper) = condition.closed_loop, (side[None] for side in domain)
 
     def crossing(j: int, t: Time, x: State) -> PerState:
-        """At most 0 where 0 ≤ h_j ≤ SHELL and ḣ_j ≥ 0."""
+        """A function that is ≤ 0 where 0 ≤ h_j ≤ SHELL and ḣ_j ≥ 0."""
 
         def h(t: Time, x: State) -> Tensor:
             return constraints(x)[..., j]
@@ -69,17 +69,17 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
     return _least(condition, (lower, upper), crossing, budget, enough)
 
 
-def beginning_level(
+def initial_violation_level(
     condition: DecreaseCondition, states: tuple[Corners, Corners], budget: Budget, enough: float
 ) -> float:
-    """A lower bound of W(0, ·) on {x ∈ X₀: some h_j ≥ SURE}; ∞ if all of X₀ is proved to satisfy the constraints.
+    """A lower bound of W(0, ·) on {x ∈ X₀: some h_j ≥ LEAST_VIOLATION}; ∞ if this set is proved to be empty.
 
-    Sampling is not enough here: a violation may lie between the samples.
+    Samples of X₀ could miss a violation.
     """
     if condition.constraints is None:
         return float("inf")
     h: Constraints = condition.constraints
-    return _least(condition, states, lambda j, t, x: SURE - h(x)[..., j], budget, enough)
+    return _least(condition, states, lambda j, t, x: LEAST_VIOLATION - h(x)[..., j], budget, enough)
 
 
 def _least(
@@ -89,7 +89,7 @@ def _least(
     budget: Budget,
     enough: float,
 ) -> float:
-    """A lower bound of W on the parts of boxes where where(j, t, x) ≤ 0 for some constraint j."""
+    """A lower bound of W on the points of boxes with where(j, t, x) ≤ 0 for some constraint j."""
     components = range(len(names_of(condition.constraints)))
     return min(minimum(condition.height, *boxes, budget, partial(where, j), 0.0, enough) for j in components)
 
@@ -99,8 +99,8 @@ def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.G
     constraints, horizon = problem.constraints, problem.horizon
     if constraints is None:
         return None
-    x0 = torch.cat([problem.initial_states.corners(), problem.initial_states.sample(LOOPS, generator)])
-    finer = problem.in_steps(steps=FINER * horizon.steps, dt=horizon.dt / FINER)
+    x0 = torch.cat([problem.initial_states.corners(), problem.initial_states.sample(SIMULATED_LOOPS, generator)])
+    finer = problem.in_steps(steps=SUBSTEPS * horizon.steps, dt=horizon.dt / SUBSTEPS)
     try:
         with torch.no_grad():
             trajectory = Rollout(finer, closed_loop.policy, "rk4", "backprop", held=False)(x0)
@@ -108,6 +108,6 @@ def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.G
         return None
     h = constraints(trajectory.x)
     node, i, j = (int(k) for k in torch.unravel_index(h.argmax(), h.shape))
-    if float(h[node, i, j]) <= SURE:
+    if float(h[node, i, j]) <= LEAST_VIOLATION:
         return None
     return Violation(x0[i].tolist(), float(trajectory.t[node]), constraints.names[j], float(h[node, i, j]))

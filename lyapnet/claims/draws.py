@@ -1,4 +1,4 @@
-"""Records the draws made for one checkpoint in its run's folder: choosing the best draw must lower the confidence."""
+"""Records the draws for one checkpoint in its run's folder, since choosing the best of them lowers the confidence."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ DRAWS = "draws.jsonl"  # file with one line for each claim from sampled states
 
 
 class Draws(NamedTuple):
-    """The recorded draws of a checkpoint for claims that differ only in the seed or the number of states.
+    """The recorded draws of a checkpoint, for claims that differ only in the seed or the number of states.
 
     Args:
         file: the record; None if the checkpoint is not in a run's folder.
@@ -23,13 +23,13 @@ class Draws(NamedTuple):
     about: Mapping[str, Any]
 
     def others(self, seed: int, samples: int) -> int:
-        """The number of other draws; a line that cannot be read counts as one."""
+        """The number of draws with another seed or number of samples; a line that cannot be read counts as one."""
         recorded = {self._draw(line, i) for i, line in enumerate(self._lines())} - {None, (seed, samples)}
         # a sampled claim with the same seed draws the same states
         return len(recorded - {("sampled", seed)})
 
     def record(self, kind: str, seed: int, samples: int, verdict: str) -> str | None:
-        """Add a draw unless it is there already; return the reason if it cannot be recorded, else None."""
+        """Record a draw unless it is recorded already; return the reason if this is impossible, else None."""
         entry = {**self.about, "kind": kind, "seed": seed, "samples": samples, "verdict": verdict}
         if self.file is None:
             return "not recorded: the checkpoint lies outside a run's folder; other draws are not accounted for"

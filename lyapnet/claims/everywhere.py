@@ -14,21 +14,20 @@ from lyapnet.claims import figures
 from lyapnet.claims.arguments import box_of
 from lyapnet.claims.certificates import FROZEN, Certificate, format_state
 from lyapnet.claims.claim import Claim, Run, option, sides_of
-from lyapnet.claims.funnel import prove_within
+from lyapnet.claims.funnel import prove_in_time
 from lyapnet.claims.preconditions import check_states, freeze, over_time, require_dimension
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.condition import DecreaseCondition, require_own_gradient
 from lyapnet.prover.proof import Proof
-from lyapnet.prover.verdict import Verdict, time_spent
+from lyapnet.prover.verdict import Verdict, time_limit_reason
 from lyapnet.task.sets import Box
 
-DRAWN = 2000  # random points in a figure
+DRAWN = 2000  # number of random points in the figure
 
 
 class PointwiseCondition(DecreaseCondition):
-    """c(t, x) ≤ 0 on a whole box, as a DecreaseCondition with the constant W = 1, so that boxes have no order, and
-    Ẇ = −1 ≤ 0.
+    """c(t, x) ≤ 0 on a whole box, as a DecreaseCondition with W = 1 and Ẇ = −1; a constant W does not order boxes.
 
     In a file its proof has the same name as that of a funnel; the fingerprints differ.
     """
@@ -49,8 +48,8 @@ class PointwiseCondition(DecreaseCondition):
 class Everywhere(Claim):
     """c(t, x) ≤ 0 for all t ∈ [0, T] and all x in a set of states D: proved on boxes, or refuted by a point.
 
-    A subclass defines c and describes its meaning. It inherits the search, the counterexample, the kept proof, the
-    table, the report and the figure.
+    A subclass defines c and says what it means. It inherits the search, the counterexample, the kept proof, the table,
+    the report and the figure.
     """
 
     states: Box | Sequence[Sequence[float]] | None = option(
@@ -80,7 +79,7 @@ class Everywhere(Claim):
         check_states(condition, domain)
         memory.check()
         set_up = run.budget.elapsed
-        proof = prove_within(
+        proof = prove_in_time(
             condition, domain, float("inf"), run.budget, generator=run.generator, report=run.report, keep=run.keep
         )
         found = Margins(claim=self, proof=proof, states=states, set_up=set_up)
@@ -122,7 +121,9 @@ class EverywhereCertificate(Certificate):
 
     def numbers(self) -> dict[str, Any]:
         proof, D, found = self.claim.proof, self.claim.states, self.claim.proof.counterexample
-        why = f"{time_spent(self.claim.set_up)}: allow more, or claim less" if self.verdict == "unknown" else None
+        why = (
+            f"{time_limit_reason(self.claim.set_up)}: allow more, or claim less" if self.verdict == "unknown" else None
+        )
         return {
             "set": [D.lower.tolist(), D.upper.tolist()], "duration": self.controller.horizon.duration, "reason": why,
             "counterexample": found and {"t": found.t, "x": found.x, "condition": found.condition},

@@ -15,7 +15,7 @@ from lyapnet.claims.certificates import FROZEN, Certificate, format_state
 from lyapnet.claims.costs import Inside, optima_of
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.evaluation.optimality import ratio_of_means
-from lyapnet.prover.verdict import Verdict, time_spent
+from lyapnet.prover.verdict import Verdict, time_limit_reason
 
 
 class LowerBoundCertificate(Certificate):
@@ -112,7 +112,7 @@ class LowerBoundCertificate(Certificate):
             return "e is as large as the bound: βV(T, ·) exceeds φ, or q < 0; allow more seconds, or lower V(T, ·)"
         if claim.verdict == "falsified" or claim.counterexample is not None:
             return "V rises faster than ℓ along some control: choose a smaller beta or a larger delta, or train on"
-        return f"{time_spent(claim.set_up)}: allow more"
+        return f"{time_limit_reason(claim.set_up)}: allow more"
 
     def in_words(self, before: str = "") -> str:
         """As Certificate.in_words.

@@ -12,9 +12,9 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import Interrupted, UsageError, signals_taken
 from lyapnet.base.types import Corner, Corners, PerState, Points, State, Value
-from lyapnet.claims.computed_laws import computed_by
+from lyapnet.claims.computed_laws import add_program_errors
 from lyapnet.claims.control_sets import check_controls, check_minimum
-from lyapnet.claims.crossing import Violation, beginning_level, crossing_level, find_violation
+from lyapnet.claims.crossing import Violation, crossing_level, find_violation, initial_violation_level
 from lyapnet.claims.ignorable_states import ignorable_states
 from lyapnet.claims.preconditions import (
     at_time,
@@ -36,26 +36,29 @@ from lyapnet.prover.condition import (
 )
 from lyapnet.prover.counterexamples import Counterexample, find_counterexample
 from lyapnet.prover.float_errors import FloatLaw
-from lyapnet.prover.proof import Progress, Proof, prove, tell
+from lyapnet.prover.proof import Progress, Proof, prove, report_stage
 from lyapnet.prover.readings import Readings
-from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
+from lyapnet.prover.verdict import Verdict, time_limit_reason, verdict_on
 from lyapnet.task.constraints import names_of
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-# a level is max V(0, ·) on X₀, or min W on the boundary of D or at a constraint; the time for each of them:
-LEVELS = 60.0  # seconds at most
-LEAST = 1.0  # seconds at least
-SHARE_OF_LEVELS = 0.3  # share of the remaining budget
-SHARE_OF_FINISH = 0.15  # share of the remaining budget that is reserved for the share of X₀ and κ
+# time for each level, such as max V(0, ·) on X₀, or min W on the boundary of D
+SHARE_OF_LEVELS = 0.3  # of the remaining budget, between these limits:
+MIN_LEVEL_SECONDS, MAX_LEVEL_SECONDS = 1.0, 60.0
+SHARE_OF_FINISH = 0.15  # of the remaining budget, for what is computed after the proof: the share of X₀ and κ
+RAYS, RAY_TIMES, RAY_RADII = 400, 9, 71  # numbers of rays, times and radii at which W is evaluated to find a set D
+LONGEST_RAY = 30.0  # relative to the largest distance of X₀ from the goal along an axis
+SET_MARGIN = 1.15  # factor by which D is larger than what these rays find
+SAMPLES = 10_000  # random states of X₀, beside its corners, among which the largest V is found
 KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command resumes it."
 NOT_KEPT = "Stopped while certifying: the proof is lost; the option keep writes it to a file."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedFunnel:
-    """With W(t, x) = V(t, x) − δt: at every (t, x) in [0, T] × D with W ≤ ρ, in continuous time and for this model,
+    """With W(t, x) = V(t, x) − δt, at every (t, x) in [0, T] × D with W ≤ ρ, in continuous time and for this model,
 
         V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
 
@@ -71,20 +74,20 @@ class ProvedFunnel:
     are 0 holds on every slice. (Such a state cannot go to infinity in finite time: its derivative is bounded.)
     The parameters of a family are constant: along them D is their range, and no closed loop leaves it there.
 
-    With `readings` the law is not read at every t. Then the inequality holds at t = t̂ + a and x = x(t̂ + a) for the
-    control u of each reading at (t̂, x̂) with W(t̂, x̂) ≤ ρ, as long as it may be in use (see Readings). By induction over
-    the readings the same follows, whatever their times are.
+    With `readings`, u is held between readings. The inequality then holds at t = t̂ + a and x = x(t̂ + a) for the control
+    u of each reading at (t̂, x̂) with W(t̂, x̂) ≤ ρ, for every a at which it may be in use (see Readings). By induction
+    over the readings the same follows, whatever their times are.
 
-    With `steps` all of this is about the steps x_{n+1} = F(x_n, u) of the horizon's method, with u = policy(t_n, x_n)
-    held, and nothing about the time between them. At each t ∈ [0, T − Δt] and x ∈ D with W ≤ ρ
+    With `steps`, the claim is about the steps x_{n+1} = F(x_n, u) of the horizon's method, with u = policy(t_n, x_n)
+    held, and not about the time between them. At each t ∈ [0, T − Δt] and x ∈ D with W ≤ ρ
 
         (V(t + Δt, F(x, u)) − V(t, x))/Δt + α ℓ̄(x, u) ≤ δ     and     F(x, u) ∈ D,
 
-    where ℓ̄ is the mean of ℓ over the step: at each of the times t_n, and between them too. By induction x_n ∈ D and
-    V(t_n, x_n) ≤ ρ + δt_n, and J is the cost of the steps. {W ≤ ρ} may touch the boundary of D.
+    where ℓ̄ is the mean of ℓ over the step; the times t_n are among these t. By induction x_n ∈ D and V(t_n, x_n) ≤
+    ρ + δt_n, and J is the cost of the steps. {W ≤ ρ} may touch the boundary of D.
 
-    The verdict is about the funnel of ρ = `wanted`, which contains all of X₀. For every verdict, `rho` is the largest
-    proved level, and {V(0, ·) ≤ rho} contains the share `volume_share` of X₀.
+    The verdict is on the funnel of ρ = `wanted`, which contains all of X₀. For every verdict, `rho` is the largest
+    proved level, and {V(0, ·) ≤ rho} contains at least the share `volume_share` of X₀.
     """
 
     alpha: float
@@ -103,7 +106,7 @@ class ProvedFunnel:
     undecided: Points  # centres (t, x) of undecided boxes
     left_out: list[int]  # the ignorable states; D has no bounds along them
     fingerprint: str = ""  # of the traced operations and numbers of (V̇ + αℓ − δ, W)
-    proof_seconds: float = 0.0  # for the boxes, without set-up and levels
+    proof_seconds: float = 0.0  # of the search, without set-up and levels
     constraints: Sequence[str] = ()  # the constraints h(x) ≤ 0 in words
     crossing: float = float("inf")  # a lower bound of W where a closed loop could begin to violate a constraint
     violation: Violation | None = None  # a closed loop from X₀ that violates a constraint, if one was found
@@ -132,7 +135,7 @@ class ProvedFunnel:
         if self.verdict != "unknown":
             return None
         if self.remaining_volume > 0:
-            return f"{time_spent(self.set_up)}: allow more, or resume a kept proof"
+            return f"{time_limit_reason(self.set_up)}: allow more, or resume a kept proof"
         if self.counterexample is not None:
             return "the condition fails close to the level that X₀ needs"
         if self.crossing <= self.wanted:
@@ -172,7 +175,7 @@ def prove_funnel(
         disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
         readings: when u is read; None: at every t.
         law: a program that computes u in floating-point numbers, whose errors count; None: u is exact.
-        steps: whether the claim is about the steps of the horizon's method, without any of the three before it.
+        steps: whether the claim is about the steps of the horizon's method; not with disturbance, readings or law.
 
     Raises:
         UsageError: α, δ or D are unsuitable; readings are of another program; an operator has no bound.
@@ -192,25 +195,27 @@ def prove_funnel(
         condition, problem, duration, states, budget, report
     )
     if law is not None:
-        tell(report, budget, "errors of the C on D")
-    condition.readings = readings = computed_by(law, readings, D, left_out)
-    levels = levels if law is None else budget_for_level(budget)  # its time runs from its construction
+        report_stage(report, budget, "errors of the C on D")
+    condition.readings = readings = add_program_errors(law, readings, D, left_out)
+    levels = levels if law is None else budget_for_level(budget)  # a new one, since its seconds have begun to run
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
     rim = float("inf") if steps else minimum(condition.height, *sides, levels, enough=just_above(needed))
     if isinstance(condition, SteppedPayment):
         domain = condition.domain_of(D, left_out)
-    begin = beginning_level(condition, at_time(0.0, x_low, x_high), budget_for_level(budget), just_above(needed))
+    begin = initial_violation_level(
+        condition, at_time(0.0, x_low, x_high), budget_for_level(budget), just_above(needed)
+    )
     crossing = min(begin, crossing_level(condition, domain, budget_for_level(budget), just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
     level = min(needed, just_below(min(rim, crossing)))
-    proof = prove_within(
+    proof = prove_in_time(
         condition, domain, level, budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=degree,
     )  # fmt: skip
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
-    if found is None and rim <= needed and budget.left:  # the proof went only up to a level below the one that X₀ needs
+    if found is None and rim <= needed and budget.left:  # look for one between the level of the proof and that of X₀
         bounded = bounded_condition(condition, domain, level=needed)
         found = find_counterexample(condition, bounded, *condition.search_box(domain), needed, generator)
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
@@ -256,7 +261,7 @@ class Setting(NamedTuple):
     states: Box  # D
     domain: tuple[Corner, Corner]  # [0, T] × D
     sides: tuple[Corners, Corners]  # [0, T] × the boundary of D
-    levels: Budget  # for the levels
+    levels: Budget  # for one level
     assumed: str  # a sentence on what is assumed of u; empty if nothing is
 
 
@@ -273,24 +278,24 @@ def find_setting(
 
     Args:
         duration: T; or 0 for a claim about t = 0 only.
-        states: D; by default a box around {W ≤ max W(0, ·) on X₀}, estimated from samples.
-        level_of: (max W(0, ·) on X₀, X₀) ↦ the level of W that D has to enclose in its place.
+        states: D; by default a box around {W ≤ level}, estimated from samples.
         budget: the budget of the claim; a share of it is for levels.
         report: called with the name of each stage.
+        level_of: (max W(0, ·) on X₀, X₀) ↦ the level of W that D must enclose; by default this maximum.
 
     Raises:
         UsageError: D is unsuitable; or the condition cannot be bounded.
     """
-    tell(report, budget, "calling and tracing f, g, the cost, V and u")
+    report_stage(report, budget, "calling and tracing f, g, the cost, V and u")
     memory = freeze(condition, over_time(problem.initial_states, duration))
     constants, goal = condition.closed_loop.system.constants, problem.goal.double()
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
     X0 = slice_at_zero(problem.initial_states, left_out)
     require_continuous(condition.V, X0.lower, X0.upper)
     levels = budget_for_level(budget)
-    tell(report, budget, "the largest V on X₀")
+    report_stage(report, budget, "the largest V on X₀")
     wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
-    tell(report, budget, "the set D; checks of the law and the condition on it")
+    report_stage(report, budget, "the set D; checks of the law and the condition on it")
     level = wanted if level_of is None else level_of(wanted, X0)
     states = slice_at_zero(states or enclosing_box(condition.height, X0, goal, duration, level, constants), left_out)
     domain = domain_around(states, X0, duration, left_out, constants)
@@ -298,24 +303,24 @@ def find_setting(
     check_states(condition, domain)
     tested = check_controls(condition.closed_loop, domain), check_minimum(condition.closed_loop, domain)
     memory.check()
-    tell(report, budget, "the least V on the boundary of D")
+    report_stage(report, budget, "the least V on the boundary of D")
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, " ".join(filter(None, tested)))
 
 
 def budget_for_level(budget: Budget) -> Budget:
-    """The budget for one level: a share of what is left, within limits."""
-    return Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
+    """The budget for one level: a share of what is left, between limits."""
+    return Budget(min(MAX_LEVEL_SECONDS, max(MIN_LEVEL_SECONDS, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
 
 
-def prove_within(
+def prove_in_time(
     condition: DecreaseCondition,
     domain: tuple[Corner, Corner],
     level: float,
     budget: Budget,
     **options: Any,
 ) -> Proof:
-    """Prove the condition within the remaining budget, without the share that is reserved for what follows.
+    """Prove the condition within the remaining budget, except the share that is reserved for what follows the proof.
 
     Args:
         options: of prove.
@@ -324,13 +329,13 @@ def prove_within(
         Interrupted: Ctrl-C or SIGTERM.
     """
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
-    tell(options.get("report"), budget, "tracing the condition, and searching for a counterexample")
+    report_stage(options.get("report"), budget, "tracing the condition, and searching for a counterexample")
     with signals_taken(search.stop.ask):
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options.get("keep")
         raise Interrupted(KEPT.format(keep) if keep else NOT_KEPT, 130)
-    tell(options.get("report"), budget, "volumes and bounds that follow from the proof")
+    report_stage(options.get("report"), budget, "volumes and bounds that follow from the proof")
     return proof
 
 
@@ -339,9 +344,8 @@ def enclosing_box(
 ) -> Box:
     """A box around X₀ and {W(t, ·) ≤ level}, estimated along rays from the goal; the proof checks it later.
 
-    Along 400 rays at 9 times, the first radius with W > level is found. This is done twice: the second time each axis
-    is scaled by the first result. Rays end at 30 times the largest distance of X₀ from the goal along an axis. Along
-    the constants the box is X₀.
+    Along each random ray and at each of several times, the first radius with W > level is found. This is done twice: in
+    the second pass each axis is scaled by the result of the first one. Along the constants the box is that of X₀.
     """
     generator = torch.Generator().manual_seed(0)
     lower, upper = initial_states.lower.double(), initial_states.upper.double()
@@ -350,21 +354,21 @@ def enclosing_box(
     inner = initial_states.reach_from(goal).double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
-    times = torch.linspace(0, duration, 9, dtype=torch.float64).unique()  # one time if T = 0
-    radii = torch.logspace(-2, 1.5, 71, dtype=torch.float64)
+    times = torch.linspace(0, duration, RAY_TIMES, dtype=torch.float64).unique()  # one time if T = 0
+    radii = torch.logspace(-2, 1.5, RAY_RADII, dtype=torch.float64)
     for _ in range(2):
-        rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
+        rays = torch.randn(RAYS, len(reach), generator=generator, dtype=torch.float64)
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-        points = (radii[:, None, None] * rays).clamp(-30 * largest, 30 * largest)
+        points = (radii[:, None, None] * rays).clamp(-LONGEST_RAY * largest, LONGEST_RAY * largest)
         points = (goal + points).clamp(least, greatest) - goal
         reach = torch.stack([_reach_below(W, t, goal, points, level) for t in times]).amax(0)
         reach = reach.clamp_min(1e-6 * float(largest))
-    reach = 1.15 * torch.maximum(reach, inner)
+    reach = SET_MARGIN * torch.maximum(reach, inner)
     return Box(torch.where(constant, lower, goal - reach), torch.where(constant, upper, goal + reach))
 
 
 def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float) -> State:
-    """The largest distance from the goal along each axis before W(t, ·) > level, on rays of points (radii, rays, n)."""
+    """The largest distance from the goal along each axis on rays of points, (radii, rays, n), until W(t, ·) > level."""
     reach, below = torch.zeros_like(goal), torch.arange(points.shape[1])
     for some in points.split(8):
         if not len(below):
@@ -378,8 +382,8 @@ def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float)
 
 
 def largest_sample(V: Value, initial_states: Box) -> float:
-    """The largest V(0, ·) among the corners of X₀ and 10 000 of its states."""
-    states = torch.cat([initial_states.corners(), initial_states.sample(10_000, torch.Generator().manual_seed(0))])
+    """The largest V(0, ·) among the corners and SAMPLES random states of X₀."""
+    states = torch.cat([initial_states.corners(), initial_states.sample(SAMPLES, torch.Generator().manual_seed(0))])
     with torch.no_grad():
         return float(V(states.new_zeros(len(states)), states).max())
 

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.claims.arguments import of_states
+from lyapnet.claims.arguments import number_of_each_state
 from lyapnet.claims.claim import ReadAtTimes
 from lyapnet.controller.controller import Controller
-from lyapnet.prover.float_errors import ULPS, WIDE
+from lyapnet.prover.float_errors import ULPS, UNBOUNDED_STATE_LIMIT
 from lyapnet.prover.readings import Readings
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlSystem
 from lyapnet.task.varying_limits import VaryingLimits
 
 
-def given_of_held(claim: ReadAtTimes) -> list[str]:
+def held_options(claim: ReadAtTimes) -> list[str]:
     """The options of a claim that are about a held law."""
     names = ("interval", "jitter", "delay", "measured", "quantised", "file")
     return [name for name in names if getattr(claim, name, None)]
@@ -32,7 +32,7 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
             limits depend on the state.
     """
     problem, system = controller.problem, controller.system
-    given = given_of_held(claim)
+    given = held_options(claim)
     refused = _reason_against(problem)
     time = claim.time or ("held" if given or (made_for == "held" and refused is None) else "continuous")
     if time != "held":
@@ -41,7 +41,7 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
         return None
     if refused is not None:
         raise UsageError(refused)
-    errors = of_states("the error", claim.measured or {}, controller)
+    errors = number_of_each_state("the error", claim.measured or {}, controller)
     constant = [system.state_names[i] for i in system.constants if errors[i]]
     if constant:
         raise UsageError(f"Expected errors of measured states, got {constant[0]}, a parameter; leave it out.")
@@ -128,7 +128,11 @@ def computed_text(readings: Readings | None, system: ControlSystem, left_out: Se
     computed = None if readings is None else readings.computed
     if computed is None:
         return ""
-    within = f", with {', '.join(system.state_names[i] for i in left_out)} within ±{WIDE:g}" if left_out else ""
+    within = (
+        f", with {', '.join(system.state_names[i] for i in left_out)} within ±{UNBOUNDED_STATE_LIMIT:g}"
+        if left_out
+        else ""
+    )
     off = " and ".join(
         f"{error!r} of {name}" for name, error in zip(system.control_names, computed.errors, strict=True)
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import State
-from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
+from lyapnet.prover.kept_proofs import read_proofs, refuse_bad_file, select_proof
 from lyapnet.prover.readings import Readings, readings_from
 from lyapnet.task.sets import Box
 
@@ -95,8 +95,8 @@ def kept_region(path: Path) -> KeptRegion:
     Raises:
         UsageError: the file is not one of a region's proof.
     """
-    content = part_of(read_proofs(path), "region", path, NEW_FILE)
-    with refusing(path):
+    content = select_proof(read_proofs(path), "region", path, NEW_FILE)
+    with refuse_bad_file(path):
         of, wanted, _ = content["of"]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64) for side in ("lower", "upper"))
         readings = readings_from(of.get("readings"), None)

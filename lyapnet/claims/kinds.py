@@ -235,14 +235,14 @@ class Reach(Claim):
         require_written_law(controller.closed_loop, self.kind)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, under_noise
+        from lyapnet.claims.arguments import box_of, with_noise
         from lyapnet.claims.reach import prove_reach
         from lyapnet.claims.reach_certificate import ReachCertificate
 
         target, *avoided = (box_of(each) for each in (self.target, *(self.avoid or ())))
         if target is None:
             raise UsageError("Expected a target to reach, got none; give its bounds, as --target=-0.5:0.5,-1:1.")
-        loop, problem = under_noise(self.noise, controller)
+        loop, problem = with_noise(self.noise, controller)
         found = prove_reach(
             loop, problem, target, [each for each in avoided if each is not None], self.probability, self.risk,
             self.rate, box_of(self.states), run.budget, run.generator, run.report, run.keep, named=self.noise,
@@ -300,11 +300,11 @@ class Region(ReadAtTimes):
         Raises:
             UsageError: it is, with a disturbance.
         """
-        from lyapnet.claims.held_laws import given_of_held
+        from lyapnet.claims.held_laws import held_options
         from lyapnet.loop.programs import RegionProgram
 
         made_for = isinstance(controller.program, RegionProgram) and controller.program.steps
-        continuous = self.disturbance or given_of_held(self)
+        continuous = self.disturbance or held_options(self)
         steps = self.time == "steps" or (self.time is None and made_for and not continuous)
         if steps and self.disturbance:
             raise UsageError(

@@ -12,7 +12,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, solve
 from lyapnet.base.types import Control, Corner, PerState, Points, State, Time, Value
-from lyapnet.claims.funnel import budget_for_level, find_setting, largest_sample, prove_within
+from lyapnet.claims.funnel import budget_for_level, find_setting, largest_sample, prove_in_time
 from lyapnet.claims.ignorable_states import ignorable_states
 from lyapnet.claims.preconditions import at_time, domain_around, require_goal, require_still, slice_at_zero
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
@@ -27,7 +27,7 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet, about_control
 from lyapnet.value.calculus import drift_lie_derivative, gradients, input_lie_derivative
 
-FINE = 5e-5  # accuracy of the bound of e, as a share of the level
+EXCESS_TOLERANCE = 5e-5  # accuracy of the bound of e, as a share of the level
 DEGREE = 3  # of the Taylor forms: V_t and the Hamiltonian cancel in terms of third order, t·x²
 
 
@@ -201,7 +201,7 @@ def prove_lower_bound(
         rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
         everywhere = min(outside, rim) >= needed
     set_up = budget.elapsed
-    proof = prove_within(
+    proof = prove_in_time(
         condition, domain, needed, budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=DEGREE,
     )  # fmt: skip
@@ -233,7 +233,7 @@ def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget)
     end, unit = at_time(T, states.lower, states.upper), max(abs(level), 1e-12)
 
     def least(function: Value) -> float:
-        return minimum(function, *end, budget_for_level(budget), unit=unit, tolerance=FINE, enough=0.0)
+        return minimum(function, *end, budget_for_level(budget), unit=unit, tolerance=EXCESS_TOLERANCE, enough=0.0)
 
     excess = -least(lambda t, x: cost.terminal(x) - (beta * condition.V(t, x)).clamp(max=level))
     below = 0.0 if is_quadratic_about_target(cost) else -least(lambda t, x: T * cost.state(x))

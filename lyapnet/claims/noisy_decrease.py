@@ -12,7 +12,7 @@ from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
 from lyapnet.prover.condition import DecreaseCondition, own_operations
 from lyapnet.value.calculus import noise_derivative, time_derivative
 
-LEAKING = 0.1  # share of 1 − p for closed loops that leave from where V is low
+LEAK_SHARE = 0.1  # share of 1 − p for closed loops that leave from where V is low
 
 
 class NoisyDecrease(DecreaseCondition):
@@ -61,8 +61,8 @@ class NoisyDecrease(DecreaseCondition):
         if not 0 < risk < math.inf:
             raise UsageError(f"Expected risk > 0, got {risk}; give it in 1/cost.")
         self.risk, self.largest, leaves = risk, largest, 1 - self.probability
-        self.level = largest - math.log((1 - LEAKING) * leaves) / risk
-        self.leak = LEAKING * leaves / (risk * self.duration)
+        self.level = largest - math.log((1 - LEAK_SHARE) * leaves) / risk
+        self.leak = LEAK_SHARE * leaves / (risk * self.duration)
 
     @property
     def facts(self) -> dict[str, Any]:

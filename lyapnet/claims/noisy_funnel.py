@@ -19,7 +19,7 @@ from lyapnet.claims.funnel import (
     enclosing_box,
     find_setting,
     largest_sample,
-    prove_within,
+    prove_in_time,
     share_of,
     terminal_excess,
 )
@@ -30,18 +30,18 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.condition import DecreaseCondition, own_constraints
-from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
+from lyapnet.prover.kept_proofs import read_proofs, refuse_bad_file, select_proof
 from lyapnet.prover.proof import Progress
-from lyapnet.prover.verdict import time_spent
+from lyapnet.prover.verdict import time_limit_reason
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
 SAMPLES = 40_000  # points (t, x) from which λ is chosen, for each box
-LARGER = (1.25, 1.5, 2.0, 3.0, 5.0, 8.0)  # levels whose boxes are tried for λ, relative to max V(0, ·) on X₀
+LEVEL_FACTORS = (1.25, 1.5, 2.0, 3.0, 5.0, 8.0)  # levels whose boxes are tried for λ, relative to max V(0, ·) on X₀
 RISKS = torch.logspace(3, -2, 81, dtype=torch.float64)  # values of λ to try, relative to 1/max V(0, ·) on X₀
-FAR = 700.0  # an exponent whose exp is a float, and above which nothing is claimed
-ROOM = 0.15  # of λ: samples have to allow as much more, since bounds need some room
+LARGEST_EXPONENT = 700.0  # an exponent whose exp is a float, and above which nothing is claimed
+SAMPLE_MARGIN = 0.15  # of λ: samples have to allow as much more, since bounds need some room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,12 @@ class ProvedNoisyFunnel(ProvedFunnel):
         if self.rho == -math.inf:
             return torch.ones_like(value)
         start = torch.exp(-self.risk * (self.rho - value))
-        later = self.risk * self.leak * self.duration * math.exp(min(self.risk * (self.wanted - self.rho), FAR))
+        later = (
+            self.risk
+            * self.leak
+            * self.duration
+            * math.exp(min(self.risk * (self.wanted - self.rho), LARGEST_EXPONENT))
+        )
         return (start + later).clamp(max=1.0)
 
     @property
@@ -96,7 +101,7 @@ class ProvedNoisyFunnel(ProvedFunnel):
         if self.verdict != "unknown":
             return None
         if self.remaining_volume > 0:
-            return f"{time_spent(self.set_up)}: allow more, or resume a kept proof"
+            return f"{time_limit_reason(self.set_up)}: allow more, or resume a kept proof"
         if self.counterexample is not None:
             return "the condition fails close to the level that this probability needs: ask for less, or allow more δ"
         return "the funnel of this probability meets the boundary of D or a constraint: ask for less, or a larger set"
@@ -146,7 +151,7 @@ def prove_noisy_funnel(
         largest = found if kept is None else max(found, kept)  # a bound that is a little higher is a bound too
         if risk is None:
             box = partial(enclosing_box, condition.height, X0, goal, duration, constants=constants)
-            boxes = [states] if states is not None else (box(level=each * largest) for each in LARGER)
+            boxes = [states] if states is not None else (box(level=each * largest) for each in LEVEL_FACTORS)
             choose_risk(condition, boxes, duration, largest)
         else:
             condition.aim(risk, largest)
@@ -164,7 +169,7 @@ def prove_noisy_funnel(
     if problem.constraints is not None:
         rim = min(rim, *levels_of_constraints(condition, problem, domain, budget, just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
-    proof = prove_within(
+    proof = prove_in_time(
         condition, domain, min(needed, just_below(rim)), budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=degree,
     )  # fmt: skip
@@ -197,14 +202,14 @@ def kept_largest(path: Path | None, condition: DecreaseCondition) -> float | Non
     """
     if path is None or not path.exists():
         return None
-    content = part_of(read_proofs(path), condition.proves, path, "take a new file")
-    with refusing(path):
+    content = select_proof(read_proofs(path), condition.proves, path, "take a new file")
+    with refuse_bad_file(path):
         return float(content["of"][0]["largest"])
 
 
 def _likely_level(condition: NoisyDecrease, rho: float) -> float:
     """The V(0, x₀) up to which closed loops stay with the probability asked for, if only ρ' = rho is proved; or −∞."""
-    exponent = min(condition.risk * (condition.level - rho), FAR)
+    exponent = min(condition.risk * (condition.level - rho), LARGEST_EXPONENT)
     later = condition.risk * condition.leak * condition.duration * math.exp(exponent)
     start = 1 - condition.probability - later
     return rho + math.log(start) / condition.risk if start > 0 else -math.inf
@@ -233,20 +238,20 @@ def choose_risk(condition: NoisyDecrease, boxes: Iterable[Box], duration: float,
     """
     best = (math.inf, 1 / max(abs(largest), 1e-6))
     for box in boxes:
-        t, V, W, rim, mean, steepness = _sampled(condition, box, duration)
+        t, V, W, rim, mean, steepness = _sample_rates(condition, box, duration)
         for risk in (RISKS / max(abs(largest), 1e-6)).tolist():
             condition.aim(risk, largest)
             inside = condition.level >= W
             if not rim > condition.level or not bool(inside.any()):
                 continue
-            fails = condition.excess(t, V, mean, (1 + ROOM) * steepness)[inside] > 0
+            fails = condition.excess(t, V, mean, (1 + SAMPLE_MARGIN) * steepness)[inside] > 0
             best = min(best, (float(fails.double().mean()), -risk), key=lambda each: each[0])
             if not bool(fails.any()):
                 return
     condition.aim(abs(best[1]), largest)
 
 
-def _sampled(
+def _sample_rates(
     condition: NoisyDecrease, box: Box, duration: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """(t, V, W, 𝓛V, ‖σᵀV_x‖²) at random points of [0, T] × D, and the least W at some of its boundary in the middle."""

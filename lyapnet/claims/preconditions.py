@@ -19,7 +19,7 @@ from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 
-NOTHING = 1e-200  # bounds of 0 differ from 0 by a tiny margin for rounding
+ROUNDING_OF_ZERO = 1e-200  # bounds of 0 differ from 0 by a tiny margin for rounding
 
 
 def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memory:
@@ -217,7 +217,7 @@ def require_still(
         under: the controls in question, in words.
     """
     bounds = BoundedFunction(rates, domain).bounds(*(end[None] for end in domain))
-    if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in bounds):
+    if not all(bool(torch.maximum(-low, high).max() <= ROUNDING_OF_ZERO) for low, high in bounds):
         raise UsageError(
             f"Expected ẋ = 0 for the constants of a system{under}, got other rates; declare only constant states."
         )

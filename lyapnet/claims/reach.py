@@ -18,11 +18,18 @@ from lyapnet.claims.funnel import (
     enclosing_box,
     find_setting,
     largest_sample,
-    prove_within,
+    prove_in_time,
     share_of,
 )
 from lyapnet.claims.noisy_decrease import require_smooth
-from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES, kept_largest, levels_of_constraints
+from lyapnet.claims.noisy_funnel import (
+    LEVEL_FACTORS,
+    RISKS,
+    SAMPLE_MARGIN,
+    SAMPLES,
+    kept_largest,
+    levels_of_constraints,
+)
 from lyapnet.claims.preconditions import at_time, over_time
 from lyapnet.claims.reach_decrease import OutsideBox, ReachDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
@@ -30,7 +37,7 @@ from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.proof import Progress, Proof
-from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
+from lyapnet.prover.verdict import Verdict, time_limit_reason, verdict_on
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
@@ -121,7 +128,7 @@ class ProvedReach:
                 "the level that this probability needs meets the boundary of D, a box to avoid or a constraint: ask "
                 "for less, choose a larger set, or train V to be higher there"
             )
-        return f"{time_spent(self.set_up)}: allow more, or resume a kept proof"
+        return f"{time_limit_reason(self.set_up)}: allow more, or resume a kept proof"
 
 
 def prove_reach(
@@ -172,8 +179,8 @@ def prove_reach(
     def level_of(found: float, X0: Box) -> float:
         largest = found if kept is None else max(found, kept)  # a bound that is a little higher is a bound too
         box = partial(enclosing_box, condition.height, X0, goal, 0.0)
-        boxes = [states] if states is not None else (box(level=each * largest) for each in LARGER)
-        choose(condition, boxes, risk, rate, largest, duration)
+        boxes = [states] if states is not None else (box(level=each * largest) for each in LEVEL_FACTORS)
+        choose_risk_and_rate(condition, boxes, risk, rate, largest, duration)
         return condition.level
 
     left_out, X0, _, D, domain, faces_of_D, levels, assumed = find_setting(
@@ -191,7 +198,7 @@ def prove_reach(
     lowest = minimum(condition.V, *at_time(0.0, D.lower, D.upper), budget_for_level(budget), unit=unit)
     condition.constraints = OutsideBox(target)
     set_up = budget.elapsed
-    proof = prove_within(
+    proof = prove_in_time(
         condition, domain, min(needed, just_below(rim)), budget,
         generator=generator, report=report, keep=keep, replay=replay,
     )  # fmt: skip
@@ -242,7 +249,7 @@ def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budge
     return minimum(condition.V, *at_time(0.0, lower, upper), budget_for_level(budget), enough=enough, unit=unit)
 
 
-def choose(
+def choose_risk_and_rate(
     condition: ReachDecrease,
     boxes: Iterable[Box],
     risk: float | None,
@@ -264,14 +271,14 @@ def choose(
     risks = [risk] if risk is not None else (RISKS / max(abs(largest), 1e-6)).tolist()
     best = (math.inf, risks[len(risks) // 2], least_rate if rate is None else rate)
     for box in boxes:
-        V, mean, variance, rim = _sampled(condition, box)
+        V, mean, variance, rim = _sample_rates(condition, box)
         possible = list[tuple[float, float, float]]()
         for each in risks:
             condition.aim(each, least_rate if rate is None else rate, largest)
             inside = condition.level >= V
             if not bool(inside.any()):
                 continue
-            falls = -(mean + (1 + ROOM) * each / 2 * variance)[inside]
+            falls = -(mean + (1 + SAMPLE_MARGIN) * each / 2 * variance)[inside]
             failing = float((falls < condition.rate).double().mean())
             allowed = max(SHARE_OF_RATE * float(falls.min()), least_rate)
             found = (failing, each, allowed if rate is None else rate)
@@ -284,7 +291,7 @@ def choose(
     condition.aim(*best[1:], largest)
 
 
-def _sampled(condition: ReachDecrease, box: Box) -> tuple[Tensor, Tensor, Tensor, float]:
+def _sample_rates(condition: ReachDecrease, box: Box) -> tuple[Tensor, Tensor, Tensor, float]:
     """(V, 𝓛V, ‖σᵀV_x‖²) at random points of D outside of the target, and the least V at some of its boundary and of
     the boxes to avoid.
     """

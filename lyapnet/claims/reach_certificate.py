@@ -19,8 +19,8 @@ from lyapnet.claims.tables import floored
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 
-PATHS, FINER = 12, 10  # closed loops to draw, and Euler–Maruyama steps for each step of Δt
-LONGEST = 20  # horizons after which a drawn closed loop ends
+PATHS, SUBSTEPS = 12, 10  # closed loops to draw, and Euler–Maruyama steps for each step of Δt
+MOST_HORIZONS = 20  # horizons after which a drawn closed loop ends
 
 
 class ReachCertificate(Certificate):
@@ -150,12 +150,12 @@ class ReachCertificate(Certificate):
         claim, horizon = self.claim, self.controller.horizon
         if claim.states.dimension != 2:  # closed loops would not lie in the slice
             return []
-        loop, dt, generator = copied(self.loop), horizon.dt / FINER, stream(0, CERTIFICATION)
+        loop, dt, generator = copied(self.loop), horizon.dt / SUBSTEPS, stream(0, CERTIFICATION)
         assert loop.noise is not None
         x = self.controller.initial_states.sample(PATHS, generator).double()
         ended, path = torch.zeros(PATHS, dtype=torch.bool), [x]
         with torch.no_grad():
-            for _ in range(LONGEST * horizon.steps * FINER):
+            for _ in range(MOST_HORIZONS * horizon.steps * SUBSTEPS):
                 ended = ended | _within(x, claim.target) | ~_within(x, claim.states)
                 if bool(ended.all()):
                     break

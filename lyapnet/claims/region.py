@@ -11,14 +11,14 @@ import torch
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Corner, Corners, Points, State, Value
-from lyapnet.claims.contraction import Contraction, contraction_around, distance_left
+from lyapnet.claims.contraction import Contraction, contraction_around, final_distance
 from lyapnet.claims.funnel import (
-    LEVELS,
+    MAX_LEVEL_SECONDS,
     Setting,
     budget_for_level,
     find_setting,
     largest_sample,
-    prove_within,
+    prove_in_time,
     require_disturbance,
     share_of,
 )
@@ -34,7 +34,7 @@ from lyapnet.prover.condition import own_constraints
 from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.proof import Progress, Proof
 from lyapnet.prover.readings import Readings
-from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
+from lyapnet.prover.verdict import Verdict, time_limit_reason, verdict_on
 from lyapnet.task.constraints import Constraints, names_of
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
@@ -42,7 +42,7 @@ from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
 PER_HORIZON = 0.01  # default of λT
-ROUGHLY = 0.1  # relative tolerance of a level that no V in D is above
+LEVEL_TOLERANCE = 0.1  # relative tolerance of a level that no V in D is above
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class ProvedRegion:
     steps: Horizon | None = None  # Δt and method of the steps; None: continuous time
 
     @property
-    def practical(self) -> bool:
+    def is_practical(self) -> bool:
         """Whether the claim is practical stability: closed loops enter {V ≤ c}, and stay there."""
         return self.disturbance is not None or self.readings is not None
 
@@ -173,10 +173,10 @@ class ProvedRegion:
     @property
     def _reason_without_hole(self) -> str | None:
         """The reason why there is no hole; None if there is one."""
-        if self.practical:
+        if self.is_practical:
             return None if self.hole > 0 else (
-                f"no levels c < ρ were found between which V(0, ·) falls under every {self._smaller}: choose a smaller "
-                f"one, or a smaller decay{self._or_narrow}"
+                f"no levels c < ρ were found between which V(0, ·) falls under every {self._cause}: choose a smaller "
+                f"one, or a smaller decay{self._parameter_advice}"
             )  # fmt: skip
         plants = "" if self.plants is None else " of all plants"
         if self.contraction is None and not self.slowest < 0:
@@ -185,12 +185,12 @@ class ProvedRegion:
                 grows = f"a step with an eigenvalue of size {math.sqrt(1 + 2 * self.steps.dt * self.slowest):.3g}"
             return (
                 f"u(0, x) does not stabilise the goal{plants}: its linearisation has {grows}; weigh every state in the "
-                f"cost, train on a longer horizon, or from states all around the goal{self._or_narrow}"
+                f"cost, train on a longer horizon, or from states all around the goal{self._parameter_advice}"
             )
         if self.contraction is None:
             return (
                 f"no box around the goal was found in time on which u(0, x){plants} is proved to contract"
-                f"{self._or_narrow}"
+                f"{self._parameter_advice}"
             )
         if not self.hole > 0:
             return "V(0, ·) is not positive around the goal, or this was not proved in time"
@@ -199,30 +199,32 @@ class ProvedRegion:
     @property
     def _reason_of_size(self) -> str:
         """The reason why the region does not contain X₀."""
-        if self.verdict == "falsified" and self.practical:
+        if self.verdict == "falsified" and self.is_practical:
             return (
-                f"V(0, ·) does not fall at the rate λ there, at a level above c, under the worst {self._smaller}: "
-                f"choose a smaller one, or a smaller decay{self._or_narrow}"
+                f"V(0, ·) does not fall at the rate λ there, at a level above c, under the worst {self._cause}: "
+                f"choose a smaller one, or a smaller decay{self._parameter_advice}"
             )
         if self.verdict == "falsified":
             leaves = "" if self.steps is None else ", or the step from there leaves D (then choose a larger set)"
             return (
                 f"V(0, ·) does not fall at the rate λ there under u(0, ·){leaves}: train on a longer horizon, or from "
-                f"states all around it, or choose a smaller decay{self._or_narrow}"
+                f"states all around it, or choose a smaller decay{self._parameter_advice}"
             )
         if self.proof is not None and self.proof.remaining_volume > 0:
-            return f"{time_spent(self.set_up)}: allow more; boxes next to another equilibrium always stay undecided"
+            return (
+                f"{time_limit_reason(self.set_up)}: allow more; boxes next to another equilibrium always stay undecided"
+            )
         if self.rim <= self.wanted:
             return "the bounds do not separate the region from the boundary of D or a constraint: choose a larger set"
         return "V(0, ·) does not fall close to the level that X₀ needs"
 
     @property
-    def _smaller(self) -> str:
+    def _cause(self) -> str:
         """What a region could have less of."""
         return "disturbance" if self.readings is None else "age and error of a reading"
 
     @property
-    def _or_narrow(self) -> str:
+    def _parameter_advice(self) -> str:
         """Further advice for a box of parameters."""
         return "" if self.plants is None else ", or narrower parameters"
 
@@ -315,13 +317,13 @@ def prove_region(
     proof, rho, set_up = None, -math.inf, budget.elapsed
     if condition.hole > 0:
         options = {"generator": generator, "report": report, "keep": keep, "replay": replay}
-        proof = prove_within(condition, domain, level, budget, **options)
+        proof = prove_in_time(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if not practical or rho == -math.inf else _ultimate_set(condition, D, n, budget)
-    precision, distance = _rounding(
+    precision, distance = _rounding_effect(
         loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen, stepped
     )  # fmt: skip
-    share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
+    share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half_of(budget))
     return ProvedRegion(
         decay=decay, states=first_states(D, n), rho=rho, rim=rim, wanted=wanted, least=largest_sample(condition.V, X0),
         hole=condition.hole, contraction=contraction, slowest=slowest, volume_share=share,
@@ -333,7 +335,7 @@ def prove_region(
     )  # fmt: skip
 
 
-def _rounding(
+def _rounding_effect(
     loop: ClosedLoop,
     nominal: ClosedLoop,
     around: Contraction | None,
@@ -346,15 +348,15 @@ def _rounding(
     precision = nominal.policy.precision if isinstance(nominal.policy, ValuePolicy) else None
     if precision is None or around is None:
         return precision, math.nan
-    return precision, distance_left(loop, around, goal, states, seen, stepped)
+    return precision, final_distance(loop, around, goal, states, seen, stepped)
 
 
 def _ultimate_set(condition: RecedingDecrease, states: Box, n: int, budget: Budget) -> tuple[Box, float]:
     """(a box around {x ∈ D: V ≤ c}, an upper bound of the share of D in this set)."""
     D = at_centre(states, range(n, states.dimension))  # V is the same for all plants
-    extent = extent_of(condition.V, D, condition.hole, _half(budget))
+    extent = extent_of(condition.V, D, condition.hole, _half_of(budget))
     return first_states(extent, n), 1 - share_of(
-        lambda t, x: -condition.V(t, x), D.lower, D.upper, -condition.hole, _half(budget)
+        lambda t, x: -condition.V(t, x), D.lower, D.upper, -condition.hole, _half_of(budget)
     )
 
 
@@ -387,7 +389,7 @@ def _open_hole(
         hole = ultimate_level(condition, setting.domain, goal, level, levels) if kept is None else kept.hole
         condition.open_everywhere(hole)
         return None, math.nan, level
-    seconds, proposed = (levels.seconds, None) if kept is None else (LEVELS, kept.contracting)
+    seconds, proposed = (levels.seconds, None) if kept is None else (MAX_LEVEL_SECONDS, kept.contracting)
     stepped = condition.problem if isinstance(condition, SteppedDecrease) else None
     contraction, slowest = contraction_around(
         condition.closed_loop, goal, setting.states, seen, seconds, proposed, stepped
@@ -398,13 +400,15 @@ def _open_hole(
         level = just_below(rim)
     else:  # a number that no V in D is above
         lower, upper = (side[None] for side in setting.domain)
-        level = -minimum(lambda t, x: -condition.V(t, x), lower, upper, budget_for_level(budget), tolerance=ROUGHLY)
+        level = -minimum(
+            lambda t, x: -condition.V(t, x), lower, upper, budget_for_level(budget), tolerance=LEVEL_TOLERANCE
+        )
     if contraction is not None:
         condition.open_hole(contraction, setting.states, seen, level, budget_for_level(budget), kept and kept.hole)
     return contraction, slowest, level
 
 
-def _half(budget: Budget) -> Budget:
+def _half_of(budget: Budget) -> Budget:
     """Half of the remaining budget."""
     return Budget(budget.left / 2, chunk=budget.chunk)
 

@@ -31,8 +31,8 @@ from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
-NEARLY = 0.999  # of the least V on the boundary of D: a larger D is needed for a region with such a ρ to grow
-PATHS, EDGE = 16, 0.03  # number of closed loops to draw; they begin where 1 − EDGE < V/ρ ≤ 1
+NEAR_BOUNDARY = 0.999  # of the least V on the boundary of D: a larger D is needed for a region with such a ρ to grow
+PATHS, PATH_MARGIN = 16, 0.03  # number of closed loops to draw; they begin where 1 − PATH_MARGIN < V/ρ ≤ 1
 
 
 class RegionCertificate(Certificate):
@@ -79,13 +79,13 @@ class RegionCertificate(Certificate):
     claim: ProvedRegion
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether no larger region is needed or possible in D: it contains X₀, or almost reaches the boundary of D."""
         claim = self.claim
         highest = claim.proof.wanted if claim.steps is not None and claim.proof is not None else claim.rim
-        return self.verdict == "certified" or claim.rho >= NEARLY * highest
+        return self.verdict == "certified" or claim.rho >= NEAR_BOUNDARY * highest
 
-    def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
+    def searched_condition(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, {0} × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop, states, w, readings = self._loop, claim.states, claim.disturbance, claim.readings
@@ -167,14 +167,14 @@ class RegionCertificate(Certificate):
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         origin = f" {self._origin}" * bool(self._origin)
         return (
-            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)}{self._nominal_text} The "
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end_of_loops(kept)}{self._nominal_text} The "
             f"volume of the region is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
             f"{f' It does not bound these states: {left_out}.' if left_out else ''}{origin} "
             f"It is about the traced operations of f, g, V and u in float64, which have these fingerprints; {FROZEN}"
         )
 
-    def _end(self, kept: str) -> str:
+    def _end_of_loops(self, kept: str) -> str:
         """What is proved of closed loops in the region.
 
         Args:
@@ -248,7 +248,7 @@ class RegionCertificate(Certificate):
         rounded = ""
         if claim.precision is not None:
             rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
-        if claim.practical:
+        if claim.is_practical:
             c = repr(claim.hole) if claim.hole > 0 else "c"
             pushed = "".join(f", w({name}) = {w!r}" for name, w in self.disturbance.items())
             used, where = "u = u(0, x)", f"at each x ∈ D with {c} ≤ V ≤ {rho}"
@@ -294,7 +294,7 @@ class RegionCertificate(Certificate):
         why = {
             "certified": "it does",
             "falsified": "V does not fall so in the sublevel set around X₀ "
-            f"(closed loops may still {'stay in it' if self.claim.practical else 'go to the goal'})",
+            f"(closed loops may still {'stay in it' if self.claim.is_practical else 'go to the goal'})",
             "unknown": self.claim.reason,
         }[self.verdict]
         plant = "".join(f", {name} = {value:.6g}" for name, value in self.claim.failing_plant.items())
@@ -302,7 +302,7 @@ class RegionCertificate(Certificate):
         if found is not None:
             after = "" if self.claim.readings is None else f", {found.after:.3g} s after a reading there,"
             where = f" At x = {format_state(found.x)}{plant}{after} it fails by {found.condition:.3g}."
-        but = f" but for {{V < {self.claim.hole!r}}}" if self.claim.practical and self.claim.hole > 0 else ""
+        but = f" but for {{V < {self.claim.hole!r}}}" if self.claim.is_practical and self.claim.hole > 0 else ""
         return f"The verdict is on the claim that a sublevel set on which V falls so{but} contains X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:
@@ -325,19 +325,19 @@ class RegionCertificate(Certificate):
         t = x.new_zeros(())
         with torch.no_grad():
             share = self.controller.V(t, x) / claim.rho
-            x0 = x[(share <= 1) & (share > 1 - EDGE)][:PATHS]
+            x0 = x[(share <= 1) & (share > 1 - PATH_MARGIN)][:PATHS]
             if not len(x0):
                 return None
             if claim.plants is not None:
                 loop = self._loop
                 x0 = torch.cat([x0, claim.plants.box.sample(len(x0), generator).to(x0)], -1)
             if claim.steps is not None:
-                return self._sequences(x0, horizon.steps)[..., :n]
+                return self._simulate_steps(x0, horizon.steps)[..., :n]
             times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
             paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
         return torch.as_tensor(paths)[..., :n]
 
-    def _sequences(self, x: Tensor, steps: int) -> Tensor:
+    def _simulate_steps(self, x: Tensor, steps: int) -> Tensor:
         """Sequences of steps from some states, (1 + steps, k, n)."""
         condition, _ = self._stepped(
             self.claim.states if self.claim.plants is None else self.claim.plants.around(self.claim.states)

@@ -58,11 +58,11 @@ class SoundCertificate(CostCertificate):
     claim: ProvedFunnel
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether no larger funnel is needed: it contains X₀."""
         return self.verdict == "certified"
 
-    def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
+    def searched_condition(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop = copied(self.controller.closed_loop)

@@ -147,7 +147,10 @@ def count_successes(
     tolerances = replace(tolerances, constraints=problem.constraints is not None)
     draw = torch.default_generator if generator is None else generator
     held = torch.cat(
-        [_events(rollout, part, _increments(problem, part, draw), tolerances, problem) for part in x0.split(batch)]
+        [
+            _check_events(rollout, part, _increments(problem, part, draw), tolerances, problem)
+            for part in x0.split(batch)
+        ]
     )
     return CountedSuccesses(x0.cpu(), held, tolerances)
 
@@ -185,10 +188,10 @@ def bound_share(
     return BoundedShare(**vars(sampled), confidence=confidence, share=share, draws=draws)
 
 
-FEWEST = 16  # a batch of so many states, one of which diverges, is not divided further: all count as failures
+SMALLEST_BATCH = 16  # number of states up to which a batch with a divergent closed loop is not halved any more
 
 
-def _events(
+def _check_events(
     rollout: Callable[..., Trajectory],
     x0: State,
     increments: Increments | None,
@@ -197,19 +200,19 @@ def _events(
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
-    One divergent closed loop stops its whole batch, which is then halved to find it. The FEWEST states around it count
-    as failures too; this can only lower a share.
+    One divergent closed loop stops its whole batch, which is then halved to find it. Up to SMALLEST_BATCH states of its
+    batch count as failures too; this can only lower a share.
     """
     try:
         with torch.no_grad():
             trajectory = rollout(x0) if increments is None else rollout(x0, increments)
     except DivergenceError:
-        if len(x0) <= FEWEST:
+        if len(x0) <= SMALLEST_BATCH:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
-        halves = x0.tensor_split(2)  # each state keeps its path of the noise: a new one would be a second chance
+        halves = x0.tensor_split(2)  # each state keeps its path of the noise; a new one would give it a second chance
         paths = (None, None) if increments is None else increments.tensor_split(2, 1)
         return torch.cat(
-            [_events(rollout, half, path, tolerances, problem) for half, path in zip(halves, paths, strict=True)]
+            [_check_events(rollout, half, path, tolerances, problem) for half, path in zip(halves, paths, strict=True)]
         )
     valid = torch.ones(len(x0), 1, dtype=torch.bool)
     if problem.domain is not None:  # f, g or the cost is not defined outside

@@ -9,19 +9,21 @@ from torch import Tensor
 from lyapnet.base.types import Corner, Corners, PerState, State, Time, Value
 from lyapnet.claims.preconditions import at_time
 from lyapnet.prover.bounds import BoundedFunction, Bounds
-from lyapnet.prover.boxes import Boxes, pieces, single
-from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, minimum, searched
+from lyapnet.prover.boxes import Boxes, divide_box, root_box
+from lyapnet.prover.branch_and_bound import Budget, Question, choose_axis, minimum, run_search
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.taylor import TaylorForm, negate, shift
 from lyapnet.task.sets import Box
 
 SAMPLES, SCALES = 5_000, 10  # samples in each box, and number of boxes around the goal, each half as large
-ROOM = 0.01  # relative margin above the highest level at which V may rise, and around a hull, where bounds are too wide
-ROOM_IN_USE = 0.3  # the same where u is held: while a control is in use V may rise by so much
+MARGIN = (
+    0.01  # relative margin above the highest level at which V may rise, and around a hull, where bounds are too wide
+)
+HELD_MARGIN = 0.3  # the same where u is held: while a control is in use V may rise by so much
 BOXES = 30_000  # boxes for the highest level at which V may rise after a reading
-FEW = 0.003  # a smaller share of D between two levels may be due to chance
-PIECES = 16  # pieces into which the box of the constants is cut, about
-LEAST = 1e-6  # the smallest c, as a share of the middle level
+LEAST_SHARE = 0.003  # a smaller share of D between two levels may be due to chance
+PIECES = 16  # boxes into which the box of the constants is cut, about
+LEAST_LEVEL = 1e-6  # the smallest c, as a share of the middle level
 
 
 def ultimate_level(
@@ -51,13 +53,13 @@ def ultimate_level(
         c = condition.values(torch.cat([t[..., None], x], -1))[0] if condition.readings else condition(t, x)
         return torch.maximum(-c, value(t, x) - middle)
 
-    room = ROOM
+    room = MARGIN
     if condition.readings is not None:
-        room, budget = ROOM_IN_USE, replace(budget, boxes=BOXES)
+        room, budget = HELD_MARGIN, replace(budget, boxes=BOXES)
         bounded = _PossibleRise(bounded_condition(condition, domain, level=level), middle)
-    lower, upper = pieces(*condition.search_box(domain), [1 + i for i in constants], PIECES)
+    lower, upper = divide_box(*condition.search_box(domain), [1 + i for i in constants], PIECES)
     highest = -minimum(lambda t, x: -value(t, x), lower, upper, budget, possible, 0.0, bounded=bounded)
-    return min(middle, max((1 + room) * highest, LEAST * middle))
+    return min(middle, max((1 + room) * highest, LEAST_LEVEL * middle))
 
 
 class _PossibleRise(Bounds):
@@ -90,7 +92,7 @@ def _levels_of_fall(
     constants: Sequence[int],
 ) -> tuple[float, float] | None:
     """The two levels with the most volume of D between them such that V falls at all samples there, or None."""
-    x, weight = _samples(*domain, goal, constants)
+    x, weight = _sample_around_goal(*domain, goal, constants)
     points = torch.cat([x.new_zeros(len(x), 1), x], -1)
     if condition.readings is not None:  # at the end of the use of each control
         points = torch.cat([points, x.new_ones(len(x), 1)], -1)
@@ -102,11 +104,11 @@ def _levels_of_fall(
     shares = value.new_zeros(len(rises) + 1)
     shares.index_add_(0, torch.searchsorted(rises, value[within & falls]), weight[within & falls])
     above = int(shares.argmax())  # the index of the upper level
-    enough = shares[above] > FEW * weight[within].sum()
+    enough = shares[above] > LEAST_SHARE * weight[within].sum()
     return (float(rises[above - 1]), float(rises[above])) if enough else None
 
 
-def _samples(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _sample_around_goal(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]) -> tuple[Tensor, Tensor]:
     """(x, weights): samples of D and of smaller boxes around the goal, where levels are close to each other."""
     share = torch.rand(SAMPLES, len(goal), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     x = lower[1:] + (upper - lower)[1:] * share
@@ -120,7 +122,7 @@ def extent_of(V: Value, states: Box, level: float, budget: Budget, t: float = 0.
     """A box around {x ∈ D: V(t, x) ≤ level}, as tight as the budget allows; at worst D."""
     (lower,), (upper,) = at_time(t, states.lower, states.upper)
     question = HullBelow(V, BoundedFunction(lambda t, x: (V(t, x),), (lower, upper)), level)
-    search = searched(question, single(lower, upper), Budget(budget.left, chunk=budget.chunk))
+    search = run_search(question, root_box(lower, upper), Budget(budget.left, chunk=budget.chunk))
     low, high = question.around(search.frontier)
     if search.given_up < torch.inf or not bool((low <= high).all()):
         return states
@@ -134,30 +136,30 @@ class HullBelow(Question):
         self.V, self.bounded, self.level = V, bounded, level
         self.hull: tuple[Tensor, Tensor] = torch.tensor(torch.inf), torch.tensor(-torch.inf)  # of points with V ≤ level
 
-    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+    def find_undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         (form,), x = self.bounded.forms(boxes.lower, boxes.upper), boxes.center
         with torch.no_grad():
             low = x[self.V(x[:, 0], x[:, 1:]) <= self.level]
-        self.hull = _hull_of(*self.hull, low, low)
+        self.hull = _join_hulls(*self.hull, low, low)
         lower, upper = self._enlarged
         within = ((boxes.lower >= lower) & (boxes.upper <= upper)).all(-1)
         chosen = ~(form.interval()[0] > self.level) & ~within
         boxes = boxes._replace(key=-(boxes.upper - boxes.lower).sum(-1))  # the largest first
-        return boxes[chosen], axis_to_cut(self.bounded, form, boxes, chosen)
+        return boxes[chosen], choose_axis(self.bounded, form, boxes, chosen)
 
     @property
     def _enlarged(self) -> tuple[Tensor, Tensor]:
         """The hull with a margin; boxes inside it need not be cut further."""
         lower, upper = self.hull
-        room = ROOM * (upper - lower)
+        room = MARGIN * (upper - lower)
         return lower - room, upper + room
 
     def around(self, undecided: Boxes) -> tuple[Tensor, Tensor]:
         """(lower, upper) of a box around {V ≤ level}, given the undecided boxes."""
-        return _hull_of(*self._enlarged, undecided.lower, undecided.upper)
+        return _join_hulls(*self._enlarged, undecided.lower, undecided.upper)
 
 
-def _hull_of(lower: Tensor, upper: Tensor, lows: Tensor, highs: Tensor) -> tuple[Tensor, Tensor]:
+def _join_hulls(lower: Tensor, upper: Tensor, lows: Tensor, highs: Tensor) -> tuple[Tensor, Tensor]:
     """The hull of a box and of other boxes."""
     if not len(lows):
         return lower, upper

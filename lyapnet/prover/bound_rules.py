@@ -1,4 +1,4 @@
-"""Rules for bounds: the Taylor form that encloses the result of each operator of a graph."""
+"""The rule of each operator of graphs: Taylor forms of its arguments ↦ a form that encloses its result."""
 
 import math
 import operator
@@ -14,7 +14,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.prover import elementary_functions as functions
 from lyapnet.prover import taylor
 from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
-from lyapnet.prover.composed_rules import COMPOSED, on_forms
+from lyapnet.prover.composed_rules import COMPOSED, for_forms
 from lyapnet.prover.linear_systems import LINEAR_SYSTEMS
 from lyapnet.prover.minima import MINIMA
 from lyapnet.prover.rounding import ROUNDED
@@ -105,7 +105,7 @@ def _negate(x: TaylorForm) -> TaylorForm:
 
 @rule(aten.sum.default, aten.sum.dim_IntList)
 def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
-    """Σ x over some axes: the terms add, and so do the remainders, since |Σ η_i| ≤ Σ r_i."""
+    """Σ x over some axes: the sums of the terms, and of the remainders, since |Σ η_i| ≤ Σ r_i."""
     x, rank = x.with_rounding(x.shape.numel()), len(x.shape)
     if not rank:
         return x
@@ -121,7 +121,7 @@ def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False,
 def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) -> TaylorForm:
     """y (1 + θ) + η with |θ| ≤ relative, |η| ≤ absolute: r grows by relative · |y| + absolute.
 
-    r is infinite where |y| may exceed the largest number of the other arithmetic.
+    r is infinite where |y| may exceed `largest`, the largest number of the other arithmetic.
     """
     y = y if isinstance(y, TaylorForm) else taylor.constant_form(_tensor(y), at)
     size = y.magnitude * (1 + 1e-9)  # the factor covers the rounding of this line and the next
@@ -156,16 +156,16 @@ def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: flo
 
 
 def _widened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
-    """The form with r + factor · e^{−threshold} (and its rounding) on boxes where y may exceed the threshold."""
+    """The form with r + factor · e^{−threshold}, rounded upwards, on boxes where y may exceed the threshold."""
     room = factor * (1.001 * torch.exp(-_tensor(threshold)) + taylor.TINY)
     return smooth.with_parts(smooth.terms, smooth.radius + torch.where(y.interval()[1] > threshold, room, 0.0))
 
 
-# Arrangements: operators that copy, move or leave out entries, without arithmetic
+# Arrangements: operators that copy, move or drop entries, without arithmetic
 
 
 def _arranging(function: Callable[..., Any]) -> Rule:
-    """The rule of an operator that only arranges entries: it arranges the terms and r in the same way."""
+    """The rule of an operator that only arranges entries: it arranges each term and r like the value."""
     return lambda *arguments, **keywords: _rearranged(function, *arguments, **keywords)
 
 
@@ -190,7 +190,7 @@ def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) 
 
 
 def _along(function: Callable[..., Any], new: int = 0) -> Rule:
-    """Like _arranging, but faster: for an operator of one axis, which adds `new` axes."""
+    """Like _arranging, but faster: for an operator along one axis that adds `new` axes."""
 
     def arrange(x: TaylorForm, dim: int = 0, *rest: Any) -> TaylorForm:
         axis = dim % (len(x.shape) + new)
@@ -245,7 +245,7 @@ ARRANGEMENTS: dict[Any, Rule] = {
 
 @rule(aten.index_add.default)
 def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
-    """x with source_i added to its entry index_i: x plus an arrangement of the source."""
+    """x with source_i added to its entry index_i: x plus a rearranged source."""
     like = x if isinstance(x, TaylorForm) else source
     x, source = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, source))
     moved = _rearranged(
@@ -269,11 +269,11 @@ def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False
 
 
 BOOLEAN_OPERATORS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
-"""Operators whose rules are also correct for boolean results: 1 · 0 is a conjunction, but 1 + 1 is no truth value."""
+"""Operators whose rules are correct for truth values too: xy is the conjunction of x and y, but 1 + 1 is none."""
 
 
 def _shape_rule(operation: Any) -> Rule:
-    """The rule of an operator that depends on the shape of its argument alone: the result is a constant tensor."""
+    """The rule of an operator that uses only the shape of its argument: the result is a constant tensor."""
     return lambda x, *arguments, **keywords: operation(torch.zeros_like(x.radius[0]), *arguments, **keywords)
 
 
@@ -285,7 +285,7 @@ for _operation in OF_SHAPE:
     rule(_operation)(_shape_rule(_operation))
 
 
-RULES.update({operation: on_forms(composed, RULES) for operation, composed in COMPOSED.items()})
+RULES.update({operation: for_forms(composed, RULES) for operation, composed in COMPOSED.items()})
 
 
 def _transposed(x: TaylorForm) -> TaylorForm:

@@ -1,4 +1,4 @@
-"""Bounds of a function on boxes: its operator graph, interpreted with Taylor forms.
+"""Bounds of a function on boxes: the graph of its operators, evaluated on Taylor forms.
 
 The function is the one that training and control use, traced at one point (t, x). Each operator has a rule in
 lyapnet.prover.bound_rules that encloses its result; an operator without a rule is refused by name. The arithmetic of
@@ -7,8 +7,8 @@ W → softplus(W), a constant mass matrix) are computed once, by torch; the boun
 numbers.
 
 All operators go through one function, _apply. It refuses a result that depends on the point and is neither float64 nor
-a truth value: the rules know nothing of the rounding of float32, of the wrap-around of integers, or of 1 + 1 = true. It
-also refuses bounds of another shape than the trace recorded.
+a truth value, since the rules do not cover the rounding of float32, the overflow of integers and the arithmetic of
+truth values (1 + 1 = 1). It also refuses bounds of another shape than the trace recorded.
 """
 
 import copy
@@ -30,24 +30,24 @@ from lyapnet.base.types import Corner, Corners, OnBoxes
 from lyapnet.graphs.tracing import trace
 from lyapnet.prover import taylor
 from lyapnet.prover.bound_kernel.kernel import BoundKernel, kernel_of
-from lyapnet.prover.bound_kernel.program import Support, of_boxes
+from lyapnet.prover.bound_kernel.program import Support, supports_of_boxes
 from lyapnet.prover.bound_rules import ARRANGEMENTS, BOOLEAN_OPERATORS, RULES
 from lyapnet.prover.rounding import rounding
 from lyapnet.prover.simplification import with_known_truths, without_copies
 from lyapnet.prover.taylor import TaylorForm, box_form, wide_axes
 
-MANY = 4000  # boxes; bounding them by torch takes as long as compiling a kernel
-TRACE_POINTS = 32  # points of the box at which the trace is compared with the function
+MANY = 4000  # number of boxes after which machine code is used; torch bounds as many while a kernel is compiled
+TRACE_POINTS = 32  # random points of the box at which the trace is compared with the function
 
 
 class Bounds(ABC):
-    """Bounds of tensors that depend on (t, x), on boxes of (t, x), as searches need them."""
+    """Bounds on boxes of (t, x) of tensors that depend on (t, x)."""
 
     degree: int
 
     @abstractmethod
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
-        """The tensors on boxes, (boxes, axes) each, as Taylor forms in the coordinates of the box."""
+        """The tensors on boxes with these corners, (boxes, axes), as forms in the coordinates of each box."""
 
     @abstractmethod
     def on(self, device: torch.device) -> "Bounds":
@@ -67,8 +67,8 @@ class BoundedFunction(Bounds):
             control flow does not depend on values.
         sample: a box (lower, upper) of (t, x), (1 + n,) each; the trace is checked at points of it.
         degree: degree of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
-        exact: ignore mark_rounded (lyapnet.prover.rounding); the bounds then hold in real arithmetic only. Minima over
-            controls, which have no derivative as one operator, are read as they are written.
+        exact: ignore mark_rounded (lyapnet.prover.rounding), so that the bounds hold in real arithmetic only, and trace
+            minima over controls by their operations. As a single operator, they have tighter bounds but no derivative.
 
     Attributes:
         graph: the torch operations of the function at one (t, x).
@@ -110,7 +110,7 @@ class BoundedFunction(Bounds):
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
         """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.
 
-        After MANY boxes on the CPU, machine code is used if it can be compiled.
+        After MANY boxes with the same wide axes, machine code bounds them on the CPU, if it can be compiled.
         """
         if lower.device.type == "cpu":
             wide = tuple(wide_axes(lower, upper).tolist())
@@ -124,18 +124,18 @@ class BoundedFunction(Bounds):
         """Machine code for boxes with a width along the same axes as these; None if it cannot be compiled."""
         wide = tuple(wide_axes(lower, upper).tolist())
         if wide not in self._kernels:
-            self._kernels[wide] = self._kernel_of(of_boxes(lower.shape[-1], wide), len(wide))
+            self._kernels[wide] = self._kernel_of(supports_of_boxes(lower.shape[-1], wide), len(wide))
         return self._kernels[wide]
 
     def _kernel_of(self, inputs: Sequence[Support], dimension: int) -> BoundKernel | None:
         return kernel_of(self._nodes, self._constants, inputs, dimension, self.degree)
 
     def image(self, box: TaylorForm, supports: Sequence[Support] | None = None) -> list[TaylorForm]:
-        """The results if (t, x) is in a form of shape (1 + n,), as forms in the same ε.
+        """The results for all (t, x) in a form of shape (1 + n,), as forms in the same ε.
 
         Args:
             supports: for each entry of the form, the indices of the terms that may be nonzero, in increasing order.
-                With it, machine code is used after MANY such forms on the CPU.
+                If given, machine code is used on the CPU after MANY boxes with these supports.
         """
         if supports is not None and box.radius.device.type == "cpu":
             key = (box.dimension, *supports)
@@ -224,7 +224,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
             "write it with other operators."
         ) from error
     recorded = node.meta.get("val")
-    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # it depends on the shape of the arguments alone
+    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # a constant
         return result.to(torch.get_default_device(), recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
@@ -239,7 +239,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
 
 
 def _compares_unrounded(node: Node, values: dict[Node, Any]) -> bool:
-    """Whether torch compares two numbers without rounding: it converts one without axes to the dtype of the other."""
+    """Whether torch compares two numbers without rounding one of them to float32, as a 0-dimensional one may be."""
     sources = node.all_input_nodes
     both = [values[source] if isinstance(values[source], Tensor) else source.meta["val"] for source in sources]
     return len(both) != 2 or torch.result_type(*both) in (torch.float64, torch.bool)

@@ -11,12 +11,12 @@ from lyapnet.base.types import Corner, Corners, PerBox
 
 
 class Boxes(NamedTuple):
-    """Boxes of (t, x), (boxes, 1 + n), time first; each has a key by which the search sorts and a node of a CutTree."""
+    """Boxes of (t, x), time first: their corners, the keys by which the search sorts them, their nodes in a CutTree."""
 
-    lower: Corners
+    lower: Corners  # (boxes, 1 + n)
     upper: Corners
-    key: PerBox
-    node: Integer[Tensor, "boxes"]  # number in the CutTree
+    key: PerBox  # boxes of lowest key are bounded first
+    node: Integer[Tensor, "boxes"]  # number of the node of a CutTree
 
     def __getitem__(self, chosen: Tensor) -> "Boxes":  # pyright: ignore[reportIncompatibleMethodOverride]
         return Boxes(*(y[chosen] for y in tuple(self)))
@@ -35,7 +35,7 @@ class Boxes(NamedTuple):
         return (self.lower + self.upper) / 2
 
     def first(self, count: int) -> tuple["Boxes", "Boxes"]:
-        """(the `count` boxes of smallest key, the others)."""
+        """(the `count` boxes of lowest key, the others)."""
         if len(self.key) <= count:
             return self, self[torch.zeros(len(self.key), dtype=torch.bool)]
         chosen = torch.zeros(len(self.key), dtype=torch.bool)
@@ -48,7 +48,7 @@ class Boxes(NamedTuple):
 
     @property
     def least(self) -> float:
-        """The smallest key; ∞ where there are no boxes."""
+        """The lowest key; ∞ if there are no boxes."""
         return float(self.key.min()) if len(self.key) else float("inf")
 
     def volumes(self, lower: Corner, upper: Corner) -> PerBox:
@@ -64,8 +64,8 @@ class Boxes(NamedTuple):
         """Cut each box in two, in the middle of one axis: first the lower halves, then the upper ones.
 
         Args:
-            axis: the axis of each box.
-            cuts: the number of each cut in a CutTree, which gives the nodes of the halves.
+            axis: the axis across which each box is cut, (boxes,).
+            cuts: the number k of each cut in a CutTree: the halves are its nodes 1 + 2k and 2 + 2k.
         """
         cut = torch.nn.functional.one_hot(axis, self.lower.shape[-1]).bool()
         lower, upper = torch.where(cut, self.center, self.lower), torch.where(cut, self.center, self.upper)
@@ -73,18 +73,21 @@ class Boxes(NamedTuple):
         return Boxes(self.lower, upper, self.key, first).joined(Boxes(lower, self.upper, self.key, first + 1))
 
 
-def roots(lower: Corners, upper: Corners, key: float = float("-inf")) -> Boxes:
-    """Boxes that are not halves of others: node 0."""
+def root_boxes(lower: Corners, upper: Corners, key: float = float("-inf")) -> Boxes:
+    """Boxes that are no halves of others, with node 0 and the same key."""
     return Boxes(lower, upper, lower.new_full((len(lower),), key), torch.zeros(len(lower), dtype=torch.long))
 
 
-def single(lower: Corner, upper: Corner, key: float = float("-inf")) -> Boxes:
-    """One box."""
-    return roots(lower[None], upper[None], key)
+def root_box(lower: Corner, upper: Corner, key: float = float("-inf")) -> Boxes:
+    """One box, the root of a CutTree."""
+    return root_boxes(lower[None], upper[None], key)
 
 
-def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -> tuple[Corners, Corners]:
-    """Divide a box into about `count` equal boxes, by cuts across those of the given axes that have a width."""
+def divide_box(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -> tuple[Corners, Corners]:
+    """(lower, upper) corners of about `count` equal boxes into which cuts across the given axes divide a box.
+
+    Axes along which the box has no width are not cut.
+    """
     lower, upper, wide = lower[None], upper[None], [axis for axis in axes if upper[axis] > lower[axis]]
     each = max(1, round(count ** (1 / max(1, len(wide)))))
     for axis in wide:
@@ -94,14 +97,15 @@ def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -
     return lower, upper
 
 
-DEEPEST = 2000  # successive cuts of a box in a proof, at most; 53 along one axis reach the rounding of float64
+DEEPEST = 2000  # largest depth of a CutTree that is read; 53 cuts across one axis reach the rounding of float64
 
 
 class CutTree:
     """A binary tree of boxes: cut k divides node n_k in the middle of axis a_k.
 
-    Node 0 is the whole box; nodes 1 + 2k and 2 + 2k are the halves that cut k makes. The leaves, nodes that no cut
-    divides, cover the box exactly for any list of cuts: two halves have the same float64 number as their common side.
+    Node 0 is the whole box; nodes 1 + 2k and 2 + 2k are the lower and upper half that cut k makes. Leaves are the nodes
+    that no cut divides. They cover the whole box without gaps, as both halves have the same float64 number as their
+    common side.
     """
 
     def __init__(self, node: Tensor | None = None, axis: Tensor | None = None):
@@ -123,15 +127,15 @@ class CutTree:
         return torch.cat(nodes), torch.cat(axes)
 
     def leaves(self, lower: Corner, upper: Corner) -> Boxes:
-        """The leaves if node 0 is the box (lower, upper), in any order.
+        """The leaves, in any order, if node 0 is the box (lower, upper).
 
         Raises:
-            ValueError: the recorded cuts are no tree.
+            ValueError: the recorded cuts are no tree, or the tree is deeper than DEEPEST.
         """
         node, axis = self.cuts
         number = torch.full((2 * self.size + 1,), -1)
         number[node] = torch.arange(self.size)
-        level, found = single(lower, upper), []
+        level, found = root_box(lower, upper), []
         while len(level.key) and len(found) <= DEEPEST:
             cut = number[level.node]
             found.append(level[cut < 0])
@@ -143,7 +147,7 @@ class CutTree:
 
 
 def faces(lower: Corner, upper: Corner, axes: Iterable[int]) -> tuple[Corners, Corners]:
-    """The faces of a box perpendicular to the given axes, as boxes of width 0 along that axis; two for each axis."""
+    """(lower, upper) corners of the faces of a box perpendicular to the given axes, two for each axis, of width 0."""
     low, high = [], []
     for axis in axes:
         for side in (lower, upper):

@@ -1,7 +1,8 @@
-"""Rules for functions with kinks and branches: if a branch is undecided on a box, the result encloses both branches.
+"""Rules for functions with kinks and branches: where a box does not decide a branch, the result encloses both branches.
 
-A truth value is a number: 1, 0, or the interval [0, 1] on a box that does not decide it. Forms are closed sets with
-room for rounding, so that of two adjacent boxes with different truth values at their common face one is undecided.
+A truth value is a number: 1 or 0 on a box on which it is constant for certain, else the interval [0, 1]. Forms are
+closed sets with room for rounding, so if a truth value changes at the common face of two boxes, one of the boxes does
+not decide it.
 """
 
 import copy
@@ -74,7 +75,7 @@ def minimum(x: Any, y: Any) -> TaylorForm:
 
 
 def _monotone_of_intervals(function: Callable[[Tensor, Tensor], Tensor], x: TaylorForm, y: TaylorForm) -> TaylorForm:
-    """A function of intervals that does not fall in either argument: its extremes are at the lower and upper ends."""
+    """f(x, y) of intervals for f that does not fall in x or y: its extremes are at both lower and both upper ends."""
     x, y = taylor.aligned(x, y)
     (x_low, x_high), (y_low, y_high) = x.interval(), y.interval()
     return between(function(x_low, y_low), function(x_high, y_high), x).with_rounding(2)
@@ -90,7 +91,7 @@ def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:
 
 
 def _within_limits(y: TaylorForm, low: Tensor, high: Tensor) -> TaylorForm:
-    """The form y, replaced by [low, high] on boxes where its bounds are wider than that or unknown."""
+    """The form y; on boxes where its bounds are wider than [low, high] or unknown, the interval [low, high]."""
     least, most = y.interval()
     low, high = (side.to(y.radius).expand_as(y.radius) for side in (torch.minimum(low, high), high))
     wide = ~(most - least <= high - low)
@@ -114,13 +115,13 @@ def between(low: OnBoxes, high: OnBoxes, like: TaylorForm) -> TaylorForm:
 
 
 def sign(x: TaylorForm) -> TaylorForm:
-    """−1, 0 or 1, which does not fall with x: from the sign of the lower bound to that of the upper one."""
+    """sgn x ∈ {−1, 0, 1}, which does not fall with x: between the signs of the lower and the upper bound of x."""
     low, high = x.interval()
     return between(low.sign(), high.sign(), x)
 
 
 def positive(x: TaylorForm) -> TaylorForm:
-    """Whether x > 0: certain if the lower bound is positive, possible if the upper one is."""
+    """Whether x > 0: certain if the lower bound of x is positive, possible if the upper bound is."""
     low, high = x.interval()
     return between((low > 0).to(low), (high > 0).to(low), x)
 
@@ -156,15 +157,15 @@ def at_least(x: Any, y: Any) -> TaylorForm:
 
 
 def equal(x: Any, y: Any) -> TaylorForm:
-    """Whether x = y: neither x > y nor y > x. It is never certain, because of the room for rounding."""
+    """Whether x = y: neither x > y nor y > x; never certain, as forms have room for rounding."""
     return conjunction(at_least(x, y), at_least(y, x))
 
 
 def where(truth: Any, x: Any, y: Any) -> TaylorForm:
-    """x where the truth is certain, y where it is impossible. On an undecided box one form encloses both:
+    """x where the truth is certain, y where it is impossible, and on undecided boxes a form that encloses both.
 
-    with polynomials X(ε) and Y(ε), x and y lie within ½ Σ_k |X_k − Y_k| + max(r, r') of ½ (X + Y)(ε), since
-    X − ½ (X + Y) = ½ (X − Y), and |ε| ≤ 1 in each term.
+    With the polynomials X(ε) and Y(ε) of x and y, both values lie within ½ Σ_k |X_k − Y_k| + max(r, r') of
+    ½ (X + Y)(ε), since X − ½ (X + Y) = ½ (X − Y), and |ε| ≤ 1 in each term.
     """
     truth, x, y = taylor.aligned(*_forms(truth, x, y))
     certain, possible = _truth(truth)
@@ -177,7 +178,7 @@ def where(truth: Any, x: Any, y: Any) -> TaylorForm:
 
 
 def _truth(x: TaylorForm) -> tuple[Tensor, Tensor]:
-    """(whether x ≠ 0 is certain at all points of the box, whether it is possible at some point)."""
+    """(whether x ≠ 0 at all points of the box for certain, whether x ≠ 0 is possible at some point)."""
     low, high = x.interval()
     return (low > 0) | (high < 0), ~(x.magnitude == 0)
 
@@ -245,7 +246,7 @@ CHOICES: dict[Any, Callable[..., TaylorForm]] = {
 
 # The comparisons in a graph
 
-COMPARISONS = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold) of the comparison x > threshold in it)
+COMPARISONS = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold), where it jumps with x > threshold)
     aten.threshold_backward.default: lambda gradient, x, threshold: (x, threshold),
     aten.leaky_relu_backward.default: lambda gradient, x, negative_slope, self_is_result: (x, 0.0),
 }
@@ -254,8 +255,8 @@ COMPARISONS = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold) o
 def decisions(graph: GraphModule) -> GraphModule | None:
     """(t, x) ↦ all truth values and signs in a graph, as numbers; None if there are none.
 
-    On a set where all of them are constant, the graph is continuous: its other operators are continuous, or choose by
-    these values.
+    On a set on which all of them are constant, the function is continuous: the other operators are continuous, or
+    choose by these values.
     """
     nodes, found = copy.deepcopy(graph.graph), list[Node]()
     for node in list(nodes.nodes):

@@ -1,7 +1,8 @@
-"""Closed forms of u = argmin and h = min over u ∈ U of uᵀWu + bᵀu + s(u), for a diagonal W that does not depend on x.
+"""Closed forms of u = argmin and h = min over u ∈ U of uᵀWu + bᵀu + s(u), for a constant diagonal W.
 
-They are u that is piecewise linear in b, for Σ wᵢ|uᵢ| and limits, and a ball with W a multiple of the identity. Machine
-code and the interpreter compute them by the same operations, so that their bounds agree.
+There are two: for s = Σ wᵢ|uᵢ| and limits of each control, u is piecewise linear in b; for a ball without s and W a
+multiple of the identity, u is −b times a function of ‖b‖. Machine code and the interpreter of graphs use the same
+operations, so that their bounds agree.
 """
 
 import itertools
@@ -16,9 +17,10 @@ from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost.control_costs import AbsoluteCost
 from lyapnet.task.cost.minimum import Known
 
-# how exact u and h of the law are: more than FORWARD and BACKWARD of lyapnet.prover.minima add up to
-OF_U, OF_H = 1e-8, 2e-9  # of (|b| + w)/r; and of (b² + w²)/r
-TIED = 512 * torch.finfo(torch.float64).eps  # of the cost: the law takes minima in orthants that are as cheap for equal
+# Largest error of the law's u, relative to (|b| + w)/r, and of its h, relative to (b² + w²)/r; each is more than the
+# errors FORWARD and BACKWARD of lyapnet.prover.minima add up to.
+ERROR_OF_U, ERROR_OF_H = 1e-8, 2e-9
+TIE = 512 * torch.finfo(torch.float64).eps  # relative difference of costs below which the law may take either orthant
 
 
 @runtime_checkable
@@ -42,7 +44,7 @@ class Arithmetic(Protocol):
 
 
 def closed_minimum(arithmetic: Arithmetic, known: Known, W: Tensor, b: Sequence[Any]) -> tuple[list[Any], Any]:
-    """(u of each control, h).
+    """(the m controls u, h) in the numbers of this arithmetic.
 
     Raises:
         NotImplementedError: there is no closed form.
@@ -64,14 +66,14 @@ def _in_ball(program: Arithmetic, known: Known, bend: Tensor, b: Sequence[Any]) 
     squared = program.combine([(1, program.square(x)) for x in b], operations=m)
     z = program.combine([(1 / s, squared)], operations=4)
     beyond = program.function("slope_within_ball", z)
-    off = [(1 / r, _error(program, x, OF_U)) for x in b]
+    off = [(1 / r, _error(program, x, ERROR_OF_U)) for x in b]
     u = [program.combine([(-1 / r, program.multiply(x, beyond)), *off], operations=m + 2) for x in b]
     least = (-s / (2 * r), program.function("within_ball", z))
-    return u, program.combine([least, (1 / r, _error(program, squared, OF_H))], operations=4)
+    return u, program.combine([least, (1 / r, _error(program, squared, ERROR_OF_H))], operations=4)
 
 
 def _between_limits(program: Arithmetic, known: Known, bend: Tensor, b: Sequence[Any]) -> tuple[list[Any], Any]:
-    """u(b) = u(β₀) + s₀(b − β₀) + Σ Δsₖ max(b − βₖ, 0) for each control, and h, the integral of it."""
+    """u(b) = u(β₀) + s₀(b − β₀) + Σ Δsₖ max(b − βₖ, 0) for each control, with bends βₖ; h sums the integrals of u."""
     parts = [] if known.costs is None else [*known.costs.costs]
     absolute = [part for part in parts if isinstance(part, AbsoluteCost)]
     if len(absolute) < len(parts):
@@ -80,7 +82,7 @@ def _between_limits(program: Arithmetic, known: Known, bend: Tensor, b: Sequence
     m, controls, values = len(b), list[Any](), list[tuple[float, Any]]()
     w = sum((part.weight for part in absolute), torch.zeros(m, dtype=torch.float64)).tolist()
     low, high = (side.double().expand(m).tolist() for side in known.controls.limits)
-    ties = _ties(program, b, [_Line.of(*numbers) for numbers in zip(bend.tolist(), w, low, high, strict=True)])
+    ties = _tie_errors(program, b, [_Line.of(*numbers) for numbers in zip(bend.tolist(), w, low, high, strict=True)])
     for x, *numbers in zip(b, bend.tolist(), w, low, high, strict=True):
         line = _Line.of(*numbers)
         r, kink, first = line.r, line.w, line.bends[0]
@@ -91,22 +93,25 @@ def _between_limits(program: Arithmetic, known: Known, bend: Tensor, b: Sequence
                 ramp = program.function("leaky", program.combine([(1, x)], -bend_at))
                 u, h = [*u, (change, ramp)], [*h, (change / 2, program.square(ramp))]
         squared = program.combine([(1 / r, program.square(x))], kink * kink / r)
-        u += [(1 / r, _error(program, x, OF_U, OF_U * kink)), *((weight / r**0.5, tie) for weight, tie in ties)]
-        h.append((1.0, _error(program, squared, OF_H)))
+        u += [
+            (1 / r, _error(program, x, ERROR_OF_U, ERROR_OF_U * kink)),
+            *((weight / r**0.5, tie) for weight, tie in ties),
+        ]
+        h.append((1.0, _error(program, squared, ERROR_OF_H)))
         controls.append(program.combine(u, line.u, operations=len(u) + 2))
         values.append((1.0, program.combine(h, line.h, operations=len(h) + 2)))
     return controls, program.combine(values, operations=m)
 
 
-def _ties(program: Arithmetic, b: Sequence[Any], lines: Sequence["_Line"]) -> list[tuple[float, Any]]:
-    """Summands of √rᵢ times an error of each uᵢ where costs |u| are minimised in each orthant, and the cheapest taken.
+def _tie_errors(program: Arithmetic, b: Sequence[Any], lines: Sequence["_Line"]) -> list[tuple[float, Any]]:
+    """Summands of √rᵢ Δuᵢ, where Δuᵢ is the error of u from orthants with nearly equal minima.
 
-    Rounding hides TIED of E = Σⱼ |uⱼ|(rⱼ|uⱼ| + |bⱼ| + wⱼ) ≤ 2 Σⱼ (|bⱼ| + wⱼ + rⱼ least |uⱼ|)²/rⱼ; ½ rᵢ(Δuᵢ)² is at most
-    that.
+    With costs wᵢ|uᵢ| the law minimises in each orthant and takes the cheapest. Rounding hides differences of cost of
+    TIE · E with E = Σⱼ |uⱼ|(rⱼ|uⱼ| + |bⱼ| + wⱼ) ≤ 2 Σⱼ (|bⱼ| + wⱼ + rⱼ least |uⱼ|)²/rⱼ, and ½ rᵢ(Δuᵢ)² is at most that.
     """
     if len(b) == 1 or not any(line.w for line in lines):
         return []
-    share = (2 * TIED) ** 0.5
+    share = (2 * TIE) ** 0.5
     sizes = [line.w + line.r * line.least for line in lines]
     return [
         (2 / line.r**0.5, _error(program, x, share, share * size))
@@ -125,10 +130,10 @@ class _Line(NamedTuple):
     r: float
     w: float
     bends: list[float]  # βₖ, increasing
-    slopes: list[float]  # left of the first, between them, and right of the last
-    u: float  # at the first bend
-    h: float  # the minimum there
-    least: float  # the least |u|
+    slopes: list[float]  # of u left of the first bend, between bends, and right of the last
+    u: float  # u at the first bend
+    h: float  # the minimum at the first bend
+    least: float  # the least |u| of all low ≤ u ≤ high
 
     @staticmethod
     def of(r: float, w: float, low: float, high: float) -> "_Line":

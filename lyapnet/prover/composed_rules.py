@@ -14,11 +14,11 @@ Rule = Callable[..., Any]
 
 
 class Operators:
-    """The rules for bounds as functions with the names of torch's operators, as in `operators.mul(x, y)`.
+    """The rules for bounds as methods with the names of torch's operators, as in `operators.mul(x, y)`.
 
     Args:
         rules: operator ↦ rule. If several overloads have a rule, the default overload is used, else that of tensors.
-        first: arguments that all rules take before those of the operator: the program of machine code, or nothing.
+        first: arguments of all rules before those of the operator: the program for machine code; none for Taylor forms.
     """
 
     def __init__(self, rules: Mapping[Any, Rule], *first: Any):
@@ -32,12 +32,12 @@ class Operators:
         raise NotImplementedError(f"no rule for bounds of {name}")
 
 
-def on_forms(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
-    """A composed rule for the interpreter."""
+def for_forms(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
+    """A composed rule for Taylor forms, as the interpreter of graphs uses it."""
     return wraps(rule)(lambda *arguments, **keywords: rule(Operators(rules), *arguments, **keywords))
 
 
-def in_programs(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
+def for_programs(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
     """A composed rule for machine code; its first argument is the program."""
     return wraps(rule)(lambda program, *arguments, **keywords: rule(Operators(rules, program), *arguments, **keywords))
 
@@ -48,7 +48,7 @@ def _subtract_from(operators: Operators, x: Any, y: Any, alpha: float = 1) -> An
 
 
 def _power(operators: Operators, x: Any, exponent: float) -> Any:
-    """xᵖ for p = ½ and whole p: (x^⌊p/2⌋)² or, for odd p, (x^⌊p/2⌋)² x; 1/x⁻ᵖ for negative p; x⁰ = 1."""
+    """xᵖ for p = ±½ and whole p: (x^⌊p/2⌋)² for even p, (x^⌊p/2⌋)² x for odd p, 1/x⁻ᵖ for negative p, and x⁰ = 1."""
     if exponent == 0:
         return torch.ones(x.shape, dtype=torch.float64)
     if exponent < 0:

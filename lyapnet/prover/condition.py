@@ -1,4 +1,4 @@
-"""The condition that a sound certificate proves, as a function of (t, x)."""
+"""The condition that a sound certificate proves, as a function of (t, x), and its bounds."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -27,19 +27,20 @@ from lyapnet.value.policy import ValuePolicy
 class DecreaseCondition(nn.Module):
     """c(t, x) = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| + α ℓ(x, u) − δ with u = policy(t, x).
 
-    Where c ≤ 0, V̇ ≤ δ − α ℓ for every disturbance d of ẋ with |d_i| ≤ w_i, since V_xᵀd ≤ Σ_i w_i |∂V/∂x_i|.
+    c ≤ 0 implies V̇ ≤ δ − α ℓ for every disturbance d of ẋ with |d_i| ≤ w_i, since V_xᵀd ≤ Σ_i w_i |∂V/∂x_i|.
 
     Args:
         closed_loop: the system, its cost, and a control law that V defines.
         alpha: α in (0, 1], the share of the running cost by which V must fall.
-        delta: δ ≥ 0, in cost per second. Near the goal all other terms tend to 0; δ > 0 leaves room for bounds.
+        delta: δ ≥ 0, in cost per second. Near the goal all other terms tend to 0, and bounds of them prove c ≤ 0 only
+            with δ > 0.
         constraints: h; c ≤ 0 is required only where h(x) ≤ 0.
         disturbance: w ≥ 0, (n,), in the units of ẋ; None means no disturbance.
-        readings: how u is read and held; None: it is read at every t.
+        readings: at which times u is computed and then held; None: u = policy(t, x) at every t.
     """
 
-    proves: ClassVar[str] = "above"  # the name of its proof in a file of kept proofs
-    partial: ClassVar[bool] = False  # whether a proof up to a lower level than the wanted one is useful
+    proves: ClassVar[str] = "above"  # name of its proof in a file of kept proofs
+    partial: ClassVar[bool] = False  # whether a proof is of use that ends below the wanted level
     disturbance: State | None
 
     def __init__(
@@ -83,7 +84,7 @@ class DecreaseCondition(nn.Module):
 
     @property
     def facts_of_readings(self) -> dict[str, Any]:
-        """Those of the readings; none where u is read at every t."""
+        """The numbers that define the readings; none if u is read at every t."""
         return {} if self.readings is None else {"readings": self.readings.facts}
 
     def forward(self, t: Time, x: State) -> PerState:
@@ -92,7 +93,7 @@ class DecreaseCondition(nn.Module):
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         """(c, W, Ẇ) with Ẇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| − δ = c − α ℓ; so c ≤ 0 implies Ẇ ≤ 0 if ℓ ≥ 0.
 
-        Where u is known as a minimum, the third part may be larger than Ẇ.
+        If u minimises a cost, the third part may be larger than Ẇ; see `decrease`.
         """
         paid, fall = self.decrease(t, x)
         return paid - self.delta, self.height(t, x), fall - self.delta
@@ -103,22 +104,23 @@ class DecreaseCondition(nn.Module):
         return paid - self.delta, self.height(t, x), fall - self.delta
 
     def decrease(self, t: Time, x: State) -> tuple[PerState, PerState]:
-        """(V̇ + αℓ, V̇ or more) with V̇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i|.
+        """(V̇ + αℓ, an upper bound of V̇) with V̇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i|.
 
         If u minimises ℓ + bᵀu, then ℓ = q + h − bᵀu with the minimum h, a concave function of b whose slope is u. So
 
             V̇ + αℓ = V_t + V_xᵀf + (gᵀV_x − αb)ᵀu + α(q + h),     V̇ ≤ V_t + V_xᵀf + (gᵀV_x − b)ᵀu + h,
 
-        as ℓ ≥ q. The law's b is gᵀV_x, so that errors of u in bounds hardly count.
+        since ℓ ≥ q. The law's b is gᵀV_x, so the factors of u nearly vanish (for α = 1), and the width of the bounds of
+        u hardly matters.
         """
         loop = self.closed_loop
         least = None
-        if isinstance(loop.policy, ValuePolicy) and loop.policy.cost is loop.cost:  # u may be made for another ℓ
+        if isinstance(loop.policy, ValuePolicy) and loop.policy.cost is loop.cost:  # else u may minimise another cost
             least = loop.policy.least(t, x)
         if least is None:
             return self._decrease_under(t, x, loop.policy(t, x))
         V_x = self.V.value_and_state_gradient(t, x)[1]
-        drift = self._pushed(gradients(self.V, t, x)[0] + drift_lie_derivative(loop.system, x, V_x), t, x)
+        drift = self._add_disturbance(gradients(self.V, t, x)[0] + drift_lie_derivative(loop.system, x, V_x), t, x)
         slope, (u, b, value) = input_lie_derivative(loop.system, x, V_x), least
         paid = drift + ((slope - self.alpha * b) * u).sum(-1) + self.alpha * (loop.cost.state(x) + value)
         return paid, drift + ((slope - b) * u).sum(-1) + value
@@ -126,19 +128,19 @@ class DecreaseCondition(nn.Module):
     def _decrease_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState]:
         """(V̇ + αℓ, V̇) for a given control."""
         loop = self.closed_loop
-        fall = self._pushed(time_derivative(self.V, loop.system, t, x, u), t, x)
+        fall = self._add_disturbance(time_derivative(self.V, loop.system, t, x, u), t, x)
         return fall + self.alpha * loop.cost.running(x, u), fall
 
-    def _pushed(self, fall: PerState, t: Time, x: State) -> PerState:
+    def _add_disturbance(self, fall: PerState, t: Time, x: State) -> PerState:
         return fall if self.disturbance is None else fall + self.worst_push(self.V.value_and_state_gradient(t, x)[1])
 
     def worst_push(self, slope: State) -> PerState:
-        """Σ_i w_i |∂V/∂x_i|, the most that a disturbance adds to V̇."""
+        """Σ_i w_i |∂V/∂x_i| with the slope ∂V/∂x, the most that a disturbance adds to V̇."""
         assert self.disturbance is not None
         return (self.disturbance * slope.abs()).sum(-1)
 
     def search_box(self, domain: tuple[Corner, Corner]) -> tuple[Tensor, Tensor]:
-        """The box of the points of `values`: the domain of (t, x), and one axis more where u is held."""
+        """The box of the points of `values`: the domain of (t, x); if u is held, with the axis a/span ∈ [0, 1]."""
         if self.readings is None:
             return domain
         lower, upper = domain
@@ -147,7 +149,8 @@ class DecreaseCondition(nn.Module):
     def values(self, points: Points) -> tuple[PerState, PerState]:
         """(c, W) at points (t, x); c is −∞ at states that a constraint excludes.
 
-        Where u is held, the points are (t̂, x̂, a/span) as in Readings, and c is that of closed loops at t̂ + a.
+        If u is held, the points are (t̂, x̂, a/span): u is read at (t̂, x̂), c is the largest of some closed loops at
+        t̂ + a, where 0 ≤ a ≤ Readings.span(t̂), and W is that at (t̂, x̂).
         """
         t, x, now = points[:, 0], points[:, 1:], points[:, 1:]
         if self.readings is None:
@@ -158,19 +161,19 @@ class DecreaseCondition(nn.Module):
         return torch.where(self.excluded(now), -torch.inf, c), self.height(t, x)
 
     def point_of(self, t: float, x: Sequence[float], after: float) -> Points:
-        """The point of `values` for a state, or for a reading and the seconds since then, (1, …)."""
+        """The point of `values` at (t, x), `after` seconds after the reading there if u is held; (1, …)."""
         point = torch.tensor([t, *x], dtype=torch.float64)
         if self.readings is None:
             return point[None]
         return torch.cat([point, after / self.readings.span(point[:1]).clamp_min(1e-9)])[None]
 
-    def meaning_of(self, point: Corner) -> tuple[float, list[float], float]:
-        """(t, x, the seconds since the reading) of a point of `values`: the inverse of `point_of`."""
+    def parts_of_point(self, point: Corner) -> tuple[float, list[float], float]:
+        """(t, x, seconds after the reading) of a point of `values`: the inverse of `point_of`."""
         t, x = point[:1], point[1 : 1 + self.n].tolist()
         return float(t), x, 0.0 if self.readings is None else float(point[-1:] * self.readings.span(t))
 
     def after_reading(self, readings: Readings, points: Points) -> tuple[PerState, Run]:
-        """(c, the state) of the worst of some closed loops at t̂ + a, for points (t̂, x̂, a/span)."""
+        """At points (t̂, x̂, a/span): c at t̂ + a, and the run, of the closed loop of simulate_runs with the largest c."""
         run = simulate_runs(self.closed_loop, readings, points[:, 0], points[:, 1:-1], points[:, -1])
         c = self.parts_under(run.t, run.x, run.u)[0]
         worst = c.argmax(0, keepdim=True)
@@ -186,17 +189,16 @@ class DecreaseCondition(nn.Module):
         return self.constraints.worst(x) > 0
 
     def height(self, t: Time, x: State) -> PerState:
-        """W(t, x) = V(t, x) − δt; trajectories stay in a sublevel set of W on which Ẇ ≤ 0."""
+        """W(t, x) = V(t, x) − δt; closed loops stay in a sublevel set of W on which Ẇ ≤ 0."""
         return self.V(t, x) - self.delta * t
 
 
 class OwnOperations(ValueFunction):
-    """V as the torch operations that it performs at one (t, x); its gradient is the derivative of these operations.
+    """V as the torch operations that it performs at one (t, x), traced once; its gradient is their derivative.
 
-    The operations are traced once, when this object is made. On batches, which proofs do not use, it is the declared V.
-
-    The gradient that V declares has no effect here: the trace of V's value contains no custom backward pass of an
-    autograd.Function, no hooks, no `detach` and no `no_grad`, and `value_and_state_gradient` of V is not called.
+    The gradient that V declares has no effect here: the trace of V's value contains no backward pass of an
+    autograd.Function, no hooks, no `detach` and no `no_grad`, and `value_and_state_gradient` of V is not called. On
+    batches, which proofs do not use, this is the declared V.
     """
 
     def __init__(self, V: ValueFunction, domain: tuple[Corner, Corner]):
@@ -237,13 +239,14 @@ def own_constraints(constraints: Constraints, domain: tuple[Corner, Corner]) -> 
 def bounded_condition(
     condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int = 2, level: float = float("inf")
 ) -> Bounds:
-    """(c, W, Ẇ), and h if there are constraints, with bounds on boxes; for every control that readings allow.
+    """(c, W, Ẇ), and h if there are constraints, with bounds on boxes of `DecreaseCondition.search_box`.
 
     V̇ is the derivative of V's traced operations, so that c ≤ 0 proves that V falls even if V declares a wrong gradient.
-    The control law is the one that runs, with the declared gradient.
+    The control law is the one that runs, with the declared gradient. If u is held, the bounds hold for all controls
+    that the readings allow.
 
     Args:
-        level: of W, below which closed loops have been since t = 0; it matters for readings.
+        level: closed loops have been in {W ≤ level} since t = 0; of use if u is held.
     """
     declared = condition.V
     try:
@@ -254,7 +257,7 @@ def bounded_condition(
                 lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain, degree
             )  # fmt: skip
         loop, (lower, upper) = condition.closed_loop, domain
-        no_width = torch.nonzero((upper == lower)[1:]).flatten().tolist()  # states on which nothing depends
+        no_width = torch.nonzero((upper == lower)[1:]).flatten().tolist()  # ignorable states and constants
         return BoundedReadings(
             lambda t, x, u: (*condition.parts_under(t, x, u), *([] if h is None else [h(x)])), loop, condition.readings,
             domain, condition.height, level, [*loop.system.constants, *no_width], condition.disturbance, degree,
@@ -266,8 +269,8 @@ def bounded_condition(
 def require_own_gradient(V: ValueFunction, domain: tuple[Corner, Corner], points: int = 500) -> None:
     """Refuse a V whose declared gradient, which training and control use, is not the derivative of its operations.
 
-    The difference of the two is bounded, including rounding, at random points of the domain. A difference in a small
-    part of the domain can be missed. Proofs do not depend on this check: bounded_condition uses the derivative.
+    The difference of the two is bounded, including rounding, at random points of the domain, so a difference in a small
+    part of the domain can be missed. Proofs do not depend on this check, as bounded_condition uses the derivative.
 
     Raises:
         UsageError: at a point, the bounds of the difference exclude 0.

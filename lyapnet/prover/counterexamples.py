@@ -11,14 +11,17 @@ from lyapnet.prover.bounded_readings import BoundedReadings
 from lyapnet.prover.bounds import BoundedFunction, Bounds
 from lyapnet.prover.condition import DecreaseCondition
 
-SAMPLES = 20_000  # points of the domain
-STEPS = 40  # of an ascent; the last has 1/1000 of the domain's width
+SAMPLES = 20_000  # random points of the domain
+STARTS = 64  # samples of greatest c at which gradient ascent starts
+STEPS = 40  # of an ascent
+FIRST_STEP, STEP_RATIO = 0.05, 0.9  # length as a share of the domain's width, which falls to 1/1000; ratio of lengths
+CONFIRMED = 256  # largest number of points at which bounds confirm that the condition fails
 
 
 class Counterexample(NamedTuple):
-    """A point at which the condition fails: its value c is positive, and so is the lower bound of c there.
+    """A point at which the condition fails: c is positive there, and so is a lower bound of c or of Ẇ.
 
-    Where u is held, u is read at (t, x), and a closed loop meets c after that.
+    Where u is held, it is read at (t, x), and the condition fails on a closed loop `after` seconds later.
     """
 
     t: float
@@ -36,7 +39,7 @@ def find_counterexample(
     level: float,
     generator: torch.Generator | None = None,
 ) -> Counterexample | None:
-    """The point with c > 0 and W ≤ level of lowest W, among samples and the paths of ascent from the worst 64 of them.
+    """The point of lowest W with c > 0 and W ≤ level among samples and points of gradient ascent from the worst ones.
 
     Args:
         bounded: (c, W, Ẇ) with bounds, which confirm the point.
@@ -48,10 +51,10 @@ def find_counterexample(
 def lowest_violation(
     condition: DecreaseCondition, bounded: Bounds, points: Points, level: float
 ) -> Counterexample | None:
-    """The point of lowest W among the given ones with W ≤ level and c > 0, confirmed by a bound of c or Ẇ; or None."""
+    """The point of lowest W with c > 0 and W ≤ level among given ones, or None; a lower bound of c or Ẇ is positive."""
     c, W = _values(condition, points)
     candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
-    candidates = candidates[W[candidates].argsort()][:256]
+    candidates = candidates[W[candidates].argsort()][:CONFIRMED]
     if not len(candidates):
         return None
     c_low, rise_low = _lower_bounds(condition, bounded, points[candidates])
@@ -59,7 +62,7 @@ def lowest_violation(
     if not len(candidates):
         return None
     first = candidates[0]
-    t, x, after = condition.meaning_of(points[first])
+    t, x, after = condition.parts_of_point(points[first])
     return Counterexample(t, x, float(c[first]), float(W[first]), after)
 
 
@@ -70,9 +73,9 @@ def violations(
     count: int,
     generator: torch.Generator | None = None,
 ) -> Points:
-    """At most `count` points (t, x) with c > 0 and W ≤ level, those of greatest c; not confirmed by bounds.
+    """The points (t, x) of greatest c, at most `count`, with c > 0 and W ≤ level; not confirmed by bounds.
 
-    Where u is held they are readings, after which c > 0.
+    Where u is held, they are points at which u is read, and c > 0 some time later.
     """
     points = _likely_violations(condition, *condition.search_box(domain), level, generator)
     c, W = _values(condition, points)
@@ -87,28 +90,28 @@ def _likely_violations(
     level: float,
     generator: torch.Generator | None,
 ) -> Points:
-    """Samples of the box, and all points of the paths of ascent from the worst 64 samples with W ≤ level."""
+    """Samples of the box, and all points of gradient ascent from the samples with W ≤ level of greatest c."""
     points = lower + (upper - lower) * torch.rand(SAMPLES, len(lower), generator=generator, dtype=torch.float64)
     c, W = _values(condition, points)
-    start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
+    start = points[torch.where(level >= W, c, -torch.inf).topk(STARTS).indices]
     return torch.cat([points, _ascend(condition, start, lower, upper)])
 
 
 def _ascend(condition: DecreaseCondition, points: Points, lower: Corner, upper: Corner) -> Float[Tensor, "passed axes"]:
-    """All points of paths along which c rises: steps of decreasing length along the signs of the gradient of c."""
+    """All points of paths on which c rises: steps of decreasing length along the signs of the gradient of c."""
     path = [points]
     for step in range(STEPS):
         with torch.enable_grad():
             leaf = path[-1].detach().requires_grad_()
             c = condition.values(leaf)[0].sum()
             (slope,) = torch.autograd.grad(c, leaf, materialize_grads=True)
-        length = 0.05 * 0.9**step * (upper - lower)
+        length = FIRST_STEP * STEP_RATIO**step * (upper - lower)
         path.append((path[-1] + length * slope.sign().nan_to_num()).clamp(lower, upper))
     return torch.cat(path)
 
 
 def _values(condition: DecreaseCondition, points: Points) -> tuple[PerState, PerState]:
-    """(c, W), where c is −∞ at states that a constraint excludes, so that they are no counterexamples."""
+    """(c, W); c is −∞ at states that a constraint excludes, so that they are no counterexamples."""
     with torch.no_grad():
         return condition.values(points)
 

@@ -27,13 +27,13 @@ class Derivatives(NamedTuple):
 
 @dataclass(frozen=True)
 class Elementary:
-    """A function f of one number with the facts that bounds need; calling it with a Taylor form x bounds f(x).
+    """A function f of one number and what its bounds need; called with a Taylor form x, it returns bounds of f(x).
 
     Args:
         function, derivative: f and f'.
-        stationary: (a, lo, hi) ↦ points that include each solution of f'(x) = a in [lo, hi]; further points do no harm.
-        defined: (lo, hi) ↦ whether f is smooth on [lo, hi]; where it is not, the remainder is infinite.
-        derivatives: the higher ones; without them the result is linear in x.
+        stationary: (a, lo, hi) ↦ points, among them all solutions of f'(x) = a in [lo, hi].
+        defined: (lo, hi) ↦ whether f is smooth on [lo, hi]; where it is not, the remainder is infinite. None: always.
+        derivatives: the higher derivatives; without them the result is linear in x.
     """
 
     function: Callable[[Tensor], Tensor]
@@ -57,10 +57,10 @@ def linearised(
     """f(x) = a x + b ± e on the interval [l, u] of x, where a is the slope of the secant; see _expanded for degree > 1.
 
     h(x) = f(x) − a x has its extremes on [l, u] at l, at u, or where f'(x) = a; b is their mean and e half their
-    difference, so that |h(x) − b| ≤ e. This holds for every a, so a may be rounded. The slope of the secant makes e of
-    second order in u − l, and as small as possible for convex and concave f. The computed points with f' = a are exact
-    up to η = 1e-12 (1 + |x|); h at such a point differs from the extreme by at most |h'|η, plus terms in η² that are
-    below the rounding of float64.
+    difference, so that |h(x) − b| ≤ e. This holds for every a, so a may be rounded. With the slope of the secant, e is
+    of second order in u − l, and as small as possible for convex and concave f. Computed points with f' = a are assumed
+    exact up to η = 1e-12 (1 + |x|); h at such a point differs from the extreme by at most |h'|η, plus terms in η² that
+    are below the rounding of float64.
 
     Args: those of Elementary.
     """
@@ -86,9 +86,9 @@ def _secant(
     stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
 ) -> TaylorForm:
     f_l, f_u = function(lo), function(hi)
-    wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # else the slope of the secant is a quotient of rounding errors
+    wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # on narrower intervals, rounding spoils the slope of the secant
     a = torch.where(wide, (f_u - f_l) / torch.where(wide, hi - lo, 1.0), derivative((lo + hi) / 2))
-    a = a if len(x.coefficients) else torch.zeros_like(a)  # a form without ε: an interval b ± e
+    a = a if len(x.coefficients) else torch.zeros_like(a)  # the result for an interval, a form without ε, is b ± e
     points = torch.stack([torch.where(p.isnan(), lo, p).clamp(lo, hi) for p in stationary(a, lo, hi)])
     f_p = function(points)
     h = torch.cat([(f_l - a * lo)[None], (f_u - a * hi)[None], f_p - a * points])
@@ -124,7 +124,7 @@ def _expanded(
     m = (lo + hi) / 2
     w = (hi - lo) / 2 * (1 + 8 * EPSILON) + 4 * EPSILON * m.abs()
     cubic = x.degree == 3
-    # on [lo, hi], because m ± w may leave the domain of f
+    # on [lo, hi] instead of m ± w, which may leave the domain of f
     low, high = (derivatives.fourth_range if cubic else derivatives.third_range)(lo, hi)
     M = (low + high) / 2
     a, b, c, k = function(m), derivative(m), derivatives.second(m) / 2, torch.zeros_like(m)
@@ -184,7 +184,7 @@ def _within_two_periods(lo: Tensor, hi: Tensor) -> Tensor:
 
 
 def _periodic(base: Tensor, lo: Tensor, hi: Tensor) -> list[Tensor]:
-    """All points ±base + 2πk, 0 ≤ base ≤ π, in an interval of at most two periods, and some outside."""
+    """All points ±base + 2πk, 0 ≤ base ≤ π, in an interval of at most two periods, and some outside it."""
     turn = 2 * torch.pi
     middle = ((lo + hi) / (2 * turn)).round() * turn
     return [sign * base + middle + k * turn for sign in (-1, 1) for k in range(-2, 3)]
@@ -195,7 +195,7 @@ def _logit(s: Tensor) -> Tensor:
 
 
 def _sigmoid_derivative(v: Tensor) -> Tensor:
-    return torch.sigmoid(v) * torch.sigmoid(-v)  # σ(1 − σ) would lose its digits where σ is close to 1
+    return torch.sigmoid(v) * torch.sigmoid(-v)  # σ(1 − σ) would cancel where σ is close to 1
 
 
 def _slope_range(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,25 +1,26 @@
-"""How far a program in floating-point numbers is off the function that it computes, bounded over boxes.
+"""Bounds over boxes of the difference between a program in floating-point numbers and the function that it computes.
 
-The program runs the operations of a graph (t, x) ↦ u one after another, each with an error: ỹ_k = f_k(ỹ) + d_k. With
-the errors s d for 0 ≤ s ≤ 1 it goes from the exact values to those of the program, so that
+The program runs the operations of a graph (t, x) ↦ u one after another, each with an error: ỹ_k = f_k(ỹ) + d_k. The
+errors s d with 0 ≤ s ≤ 1 lead from the exact values (s = 0) to those of the program (s = 1), so that
 
     ũ_j − u_j = Σ_k d_k ∫ ∂u_j/∂y_k ds,     |ũ_j − u_j| ≤ S_j(t, x) = Σ_k |∂u_j/∂y_k| |d_k|,
 
-with each factor at its largest under all errors. S is a function like others: autograd has the derivatives,
-`mark_rounded` lets bounds hold for all errors at once, and boxes are cut until the largest S is known. Kinks do no
-harm: for almost all d the path meets them at single s, and bounds enclose the derivatives on both sides. Where a truth
-may flip, both branches count: the error of where(c, a, b) is |a − b| on boxes that do not decide c.
+with each factor at its largest under all errors. S is bounded like other functions: its derivatives are those of
+autograd, `mark_rounded` makes bounds hold for all errors at once, and boxes are cut until the largest S is known. Kinks
+are covered: for almost all d the path crosses them at isolated s, and bounds enclose the derivatives on both sides. So
+are truth values that rounding may change: the error of where(c, a, b) is |a − b| on boxes on which c may be both.
 
 Errors |d_k|, with u = 2⁻²⁴ in float32 and 2⁻⁵³ in float64 (Higham, "Accuracy and Stability of Numerical Algorithms",
-chapters 2 to 4), plus the smallest normal number for what underflows:
+chapters 2 to 4), plus the smallest normal number for underflow:
 
 * + − · / and √, the rounding of t and x, and that of each constant: u |y|. A product by a power of two is exact.
 * Sums of n products, in any order: γ Σ |a_i b_i| with γ = k u/(1 − k u), k = n, or n + 1 with rounded constants.
-* Functions of the C library: ULPS units in the last place, which is assumed of it: 2 · ULPS · u |y|.
+* Functions of the C library: 2 · ULPS · u |y|, on the assumption that they err by at most ULPS units in the last place.
 
-Fused products and sums leave errors out. Where others use a product too, a sum may fuse it and they not: the sum then
-has the error of the product once more. Results in a wider format are rounded twice, for which WIDER makes u larger. Not
-covered is arithmetic in another order, as compilers do it by -ffast-math.
+A compiler may fuse a product with the sum that uses it, which leaves the rounding of the product out. If other
+operations use the product too, they may take its rounded value; the sum is then given the error of the product once
+more. A compiler may also compute in a wider format and round twice, for which DOUBLE_ROUNDING enlarges u. Arithmetic in
+another order, as with -ffast-math, is not covered.
 """
 
 import math
@@ -39,7 +40,7 @@ from lyapnet.base.types import Corner, PerState, State, Time
 from lyapnet.graphs.c_functions import without_shape_sources
 from lyapnet.graphs.tracing import is_view, name_of
 from lyapnet.prover.bounds import BoundedFunction
-from lyapnet.prover.boxes import pieces
+from lyapnet.prover.boxes import divide_box
 from lyapnet.prover.branch_and_bound import Budget, minimum
 from lyapnet.prover.readings import Computed
 from lyapnet.prover.rounding import mark_rounded
@@ -49,27 +50,29 @@ from lyapnet.prover.taylor import EPSILON
 aten = torch.ops.aten
 
 ULPS = 4
-"""Units in the last place by which functions of the C library are assumed to err at most."""
-WIDE = 1e6
-"""Within ± so much, in its unit, a program takes a state that nothing depends on, which sets of states do not bound."""
-WIDER = 1 + 2.0**-10
-FOLDED = 4.0  # units of float64 by which a constant that torch computed may be off in the claim
-TOLERANCE = 0.2  # relative to the largest S, up to which boxes are cut
-START, BOXES = 4096, 200_000  # boxes from which a search begins, about, and that are bounded at most
+"""Largest error of functions of the C library that is assumed, in units in the last place."""
+UNBOUNDED_STATE_LIMIT = 1e6
+"""Assumed largest |x_i|, in its unit, of states that nothing depends on and that sets of states do not bound."""
+DOUBLE_ROUNDING = 1 + 2.0**-10
+"""Factor of u for results that are first rounded to a format with at least 11 more bits."""
+FOLDED_UNITS = 4.0
+"""Error in float64, in units of rounding, of constants that torch computed: the claim may use other operators."""
+TOLERANCE = 0.2  # relative difference between the bound of S and a value of S at which a search ends
+START, BOXES = 4096, 200_000  # number of boxes at the start of a search, about, and largest number of bounded boxes
 
 
 class Format(NamedTuple):
-    """Floating-point numbers."""
+    """A format of floating-point numbers."""
 
     name: str
-    unit: float  # by which a result is rounded at most, relative to it
+    unit: float  # u, the largest relative rounding error
     least: float  # the smallest normal number
-    largest: float
+    largest: float  # the largest number
 
 
 FORMATS = {
-    torch.float32: Format("float32", WIDER * 2.0**-24, 2.0**-126, 3.4e38),
-    torch.float64: Format("float64", WIDER * 2.0**-53, 2.0**-1022, 1.79e308),
+    torch.float32: Format("float32", DOUBLE_ROUNDING * 2.0**-24, 2.0**-126, 3.4e38),
+    torch.float64: Format("float64", DOUBLE_ROUNDING * 2.0**-53, 2.0**-1022, 1.79e308),
 }
 
 
@@ -79,13 +82,13 @@ class FloatLaw:
 
     Args:
         graph: (t (), *parts of x) ↦ (u (m,),), the operations of the program in real numbers, in their order.
-        sizes: of the parts of x: (n,), or (n, k) with k parameters of a family.
-        dtype: in which it computes.
-        moved: by how much each of its limits is moved inwards, (m,).
-        latest: the time in s up to which it is this graph.
-        sha256: of its file.
-        path: of its file.
-        claimed: the claim that its file states; empty without one.
+        sizes: sizes of the parts of x: (n,), or (n, k) with k parameters of a family.
+        dtype: the format in which it computes.
+        moved: distance by which each limit of u is moved inwards, in the unit of u, (m,).
+        latest: the program computes this graph for 0 ≤ t ≤ latest, in s.
+        sha256: hash of the program's file.
+        path: path of that file.
+        claimed: the claim that the file states; empty without one.
     """
 
     graph: GraphModule
@@ -101,18 +104,18 @@ class FloatLaw:
         return self.path
 
     def computed_on(self, states: tuple[Corner, Corner]) -> Computed:
-        """How far it is off at states of a box, rounded upwards to two digits; Raises: as `errors`."""
-        errors = tuple(_upwards(error) for error in self.errors(states))
+        """The program with its `errors` at states of a box, rounded upwards to two digits; raises as `errors` does."""
+        errors = tuple(_round_up(error) for error in self.errors(states))
         return Computed(self.sha256, FORMATS[self.dtype].name, errors, self.latest)
 
     def errors(self, states: tuple[Corner, Corner], boxes: int = BOXES) -> list[float]:
         """Bounds of |ũ_j − u_j| over all 0 ≤ t ≤ latest and states of a box, (m,), in the units of u.
 
         Args:
-            boxes: that are bounded at most, for each control.
+            boxes: largest number of bounded boxes, for each control.
 
         Raises:
-            UsageError: an operation without rule for its error; or no bound is found.
+            UsageError: an operation has no rule for its error; or no bound is found.
         """
         ends = zip((0.0, self.latest), states, strict=True)
         lower, upper = (torch.cat([side.new_tensor([t]), side]) for t, side in ends)
@@ -125,6 +128,7 @@ class FloatLaw:
         return found
 
     def _error(self, j: int, lower: Corner, upper: Corner, boxes: int) -> float:
+        """An upper bound of S_j over a box of (t, x)."""
         graph = with_limited_arguments(without_shape_sources(self.graph))
         numbers = FORMATS[self.dtype]
         known, ends = _constants(graph, numbers), list(accumulate(self.sizes))
@@ -143,13 +147,14 @@ class FloatLaw:
         bounded = BoundedFunction(lambda t, x: (-total(t, x),) * 2, (lower, upper))
         at_points = torch.vmap(lambda t, x: bounded.graph(t, x)[0])
         search = Budget(float("inf"), boxes=boxes)
-        # a search from one box would cut it along one axis, as forms of S on wide boxes improve by cuts along several
-        start = pieces(lower, upper, range(len(lower)), START)
+        # Many boxes at the start: on a wide box, bounds of S improve only by cuts across several axes together, and a
+        # search from one box compares cuts across single axes.
+        start = divide_box(lower, upper, range(len(lower)), START)
         return -minimum(at_points, *start, search, tolerance=TOLERANCE, bounded=bounded)
 
 
-def _upwards(error: float) -> float:
-    """A number that is not smaller, of two digits."""
+def _round_up(error: float) -> float:
+    """A number of two digits that is not smaller."""
     digit = 10.0 ** (math.floor(math.log10(error)) - 1) if error else 1.0
     rounded = float(f"{math.ceil(error / digit * (1 - 1e-9)) * digit:.1e}")
     return rounded if rounded >= error else float(f"{rounded + digit:.1e}")
@@ -157,19 +162,19 @@ def _upwards(error: float) -> float:
 
 @dataclass(frozen=True)
 class _Constant:
-    """A value that does not depend on (t, x), and what a program makes of it."""
+    """A value that does not depend on (t, x), with the error that it has in a program."""
 
     value: Any
-    units: float = 0.0  # of rounding, by which the program's number may be off
-    scales: bool = False  # whether a product with it is exact, a power of two
+    units: float = 0.0  # largest relative error of the program's number, in units of rounding
+    scales: bool = False  # whether it is an exact power of two, so that products with it are exact
 
 
 def _constant(value: Any, numbers: Format, computed: bool = False) -> _Constant:
-    """A constant; one that torch computed may be another in the claim, where it has other operators for the same."""
+    """A constant; `computed` means by torch's operators, and so with the error FOLDED_UNITS in float64."""
     if not isinstance(value, Tensor | int | float):
         return _Constant(value)
     y = torch.as_tensor(value).double()
-    folded = FOLDED * (computed and isinstance(value, Tensor) and value.is_floating_point())
+    folded = FOLDED_UNITS * (computed and isinstance(value, Tensor) and value.is_floating_point())
     units = folded if numbers.name == "float64" else 1.0 - bool((y.float().double() == y).all())
     return _Constant(value, units, not units and bool((y.frexp().mantissa.abs() == 0.5).all()))
 
@@ -188,18 +193,18 @@ def _constants(graph: GraphModule, numbers: Format) -> dict[Node, _Constant]:
 
 
 class _Program(Interpreter):
-    """Runs a graph in real numbers, marks the errors of a program, and collects them: (y_k, a bound of |d_k|).
+    """Runs a graph in real numbers, marks the errors of a program for bounds, and collects (y_k, a bound of |d_k|).
 
     Args:
-        known: the values that do not depend on the point.
-        at: the point.
+        known: the values that do not depend on the point (t, x).
+        at: t.
     """
 
     def __init__(self, graph: GraphModule, known: Mapping[Node, _Constant], numbers: Format, at: Tensor):
         super().__init__(graph)
         self.extra_traceback = False  # messages are for users
         self.errors = list[tuple[Tensor, Tensor]]()
-        self.fused = list[bool]()  # whether the arguments of the operation may be products that others use too
+        self.fused = list[bool]()  # for each argument of an operation: whether it may be a product with other uses
         self.numbers, self._known, self._at = numbers, known, at
 
     def run_node(self, n: Node) -> Any:
@@ -219,19 +224,19 @@ class _Program(Interpreter):
         return RULES[name_of(n.target)](self, n.target, *arguments, **keywords)
 
     def rounded(self, y: Tensor, units: float = 1.0, more: Any = 0.0) -> Tensor:
-        """y with an error of so many units of rounding, relative to it, and of one relative to `more`."""
+        """y with an error of units · u |y| + u · more + the smallest normal number."""
         _, unit, least, largest = self.numbers
         marked = mark_rounded(y, self._at, units * unit, least, largest)
         return self.with_error(marked, units * unit * y.detach().abs() + least + unit * more)
 
     def with_error(self, y: Tensor, error: Tensor) -> Tensor:
-        """y, whose error has a bound."""
+        """y, with a bound of its error |d|, whose influence on u is part of S."""
         y = y if y.requires_grad else y.detach().requires_grad_()
         self.errors.append((y, error))
         return y
 
     def plain(self, value: Any) -> Any:
-        """A value with its constants as the program has them."""
+        """A value whose constants are replaced by the program's numbers, with their errors."""
         return tree_map(lambda leaf: self._as_held(leaf) if isinstance(leaf, _Constant) else leaf, value)
 
     def _as_held(self, constant: _Constant) -> Any:
@@ -240,20 +245,20 @@ class _Program(Interpreter):
         return self.rounded(torch.as_tensor(constant.value, dtype=torch.float64), constant.units)
 
     def constant(self, value: Any) -> Any:
-        """A number in an operation as a constant; other values as they are."""
+        """A plain number as a _Constant; other values unchanged."""
         return _constant(value, self.numbers) if isinstance(value, int | float) else value
 
     def gamma(self, roundings: float) -> float:
-        """The largest relative error after so many roundings."""
+        """γ = k u/(1 − k u), the largest relative error after k roundings."""
         return roundings * self.numbers.unit / (1 - roundings * self.numbers.unit)
 
     def mark(self, y: Tensor, roundings: float, error: float = 0.0) -> Tensor:
-        """y for bounds, after so many roundings and with an error; it has none where it may overflow."""
+        """y, whose bounds hold after so many roundings and an absolute error; infinite where y may overflow."""
         return mark_rounded(y, self._at, self.gamma(roundings), error, self.numbers.largest / 2)
 
 
 def _is_shared_product(node: Node, shared: bool = False) -> bool:
-    """Whether a value may be a product, or a copy of some, that others use too."""
+    """Whether a value may be a product, or a copy of products, that other operations use too."""
     shared = shared or len(node.users) > 1
     if name_of(node.target) in ("mul", "pow"):
         return shared
@@ -265,7 +270,7 @@ Rule = Callable[..., Any]
 
 
 def _exact(program: _Program, target: Any, *arguments: Any, **keywords: Any) -> Any:
-    """An operation without rounding, of constants that may be rounded."""
+    """An operation without rounding; its constants may be rounded."""
     return target(*program.plain(arguments), **program.plain(keywords))
 
 
@@ -291,7 +296,7 @@ def _sum_of_two(program: _Program, target: Any, a: Any, b: Any, *, alpha: float 
 
 
 def _product_of_two(program: _Program, target: Any, a: Any, b: Any, **options: Any) -> Tensor:
-    """ab or a/b; of a constant that is not exact, both are rounded."""
+    """ab or a/b; the error of an inexact constant is added to that of the operation."""
     if options.get("rounding_mode") is not None:
         raise UsageError(f"Expected operations whose errors in C are known, got {target} with rounding; write others.")
     a, b = program.constant(a), program.constant(b)
@@ -315,7 +320,7 @@ def _sum(program: _Program, target: Any, x: Tensor, dim: Any = None, keepdim: bo
     if terms < 2:
         return total(x)
     roundings = terms - 1 + program.fused[0]
-    size = program.mark(total(x.detach().abs()), 0)  # of all partial sums
+    size = program.mark(total(x.detach().abs()), 0)  # bounds all partial sums
     return program.with_error(total(program.mark(x, roundings)), program.gamma(roundings) * size)
 
 
@@ -330,7 +335,7 @@ def _matrix_product(program: _Program, target: Any, a: Any, b: Any) -> Tensor:
     left, right = (each.value.double() if isinstance(each, _Constant) else each for each in (a, b))
     roundings, lost = left.shape[-1] + units, program.numbers.least * left.shape[-1]
     size = program.mark(target(left.detach().abs(), right.detach().abs()), 0)
-    if isinstance(a, _Constant):  # errors of the summands are those of one factor
+    if isinstance(a, _Constant):  # the errors of the summands are marked at the factor that depends on the point
         y = target(left, program.mark(right, roundings))
     else:
         y = target(program.mark(left, roundings), right)
@@ -338,7 +343,7 @@ def _matrix_product(program: _Program, target: Any, a: Any, b: Any) -> Tensor:
 
 
 def _index_put(program: _Program, target: Any, x: Any, indices: Any, values: Any, accumulate: bool = False) -> Tensor:
-    """x with other entries at some places, or with values that are added there one after another."""
+    """x with some entries replaced, or with values that are added to them one after another (accumulate)."""
     x, indices, values = program.plain((x, indices, values))
     if not accumulate:
         return target(x, indices, values)
@@ -358,13 +363,13 @@ def _clamp(program: _Program, target: Any, x: Tensor, low: Any = None, high: Any
 
 
 def _comparison(program: _Program, target: Any, a: Any, b: Any) -> Tensor:
-    """A truth about a − b, as a constant b may be rounded."""
+    """The comparison of a − b with 0, so that bounds include the rounding of a constant b."""
     a, b = program.plain([program.constant(a), program.constant(b)])
     return getattr(aten, name_of(target)).Scalar(a - b, 0)
 
 
 def _may_flip(truth: Tensor) -> Tensor:
-    """0; for bounds 1 where a truth is not decided."""
+    """c (1 − c) of a truth value c: 0 for values; its bounds include 1 on boxes on which c may be both."""
     c = truth.double()
     return c * (1 - c)
 
@@ -378,13 +383,13 @@ def _where(program: _Program, target: Any, truth: Any, a: Any, b: Any) -> Tensor
 
 
 def _copied(program: _Program, target: Any, x: Tensor, **options: Any) -> Tensor:
-    """x; a truth as a number may flip."""
+    """x in another format; a truth value as a number has an error of 1 where rounding may change it."""
     y = target(x, **options)
     return program.with_error(y, _may_flip(x)) if x.dtype == torch.bool else y
 
 
 COPIES = ("cat", "stack", "clone", "alias", "lift_fresh_copy", "_unsafe_view", "index", "flip")
-"""Operators that copy numbers."""
+"""Operators that only copy numbers."""
 RULES: dict[str, Rule] = {
     **dict.fromkeys(("add", "sub"), _sum_of_two),
     **dict.fromkeys(("mul", "div"), _product_of_two),
@@ -401,7 +406,7 @@ RULES: dict[str, Rule] = {
     "sigmoid": _elementwise(2 * ULPS + 3),  # 1/(1 + exp(−x)): the error of exp, and of a sum and a quotient
     "index_put": _index_put,
     "clamp": _clamp,
-    "relu": lambda program, target, x: x.clamp(min=0),  # whose derivative asks whether x > 0, not whether the result is
+    "relu": lambda program, target, x: x.clamp(min=0),  # its derivative compares x with 0
     **dict.fromkeys(("gt", "ge", "lt", "le"), _comparison),
     "where": _where,
     "_to_copy": _copied,
@@ -413,4 +418,4 @@ RULES: dict[str, Rule] = {
         _exact,
     ),
 }  # fmt: skip
-"""Name of an operator ↦ its rule, (program, operator, *arguments) ↦ the result with its errors."""
+"""Name of an operator ↦ its rule: (program, operator, *arguments) ↦ the result, with its errors in the program."""

@@ -2,16 +2,16 @@
 
 A file holds one proof, or the two proofs of a two-sided claim, under their names (`DecreaseCondition.proves`). A proof
 consists of plain data: what it is about, how the domain was cut (5 bytes a cut), which leaves are closed (decided),
-which wait (undecided), and the counterexample that lowered the level. A SHA-256 digest precedes the data. The data are
-verified as follows when they are read:
+which are waiting (undecided), and the counterexample that lowered the level. A SHA-256 digest precedes the data. A
+reader verifies them as follows:
 
-* A changed bit, a truncated file and a file of an earlier format are detected by the digest or the first line.
+* The digest and the first line detect changed bits, truncated files and files of an earlier format.
 * The leaves are computed from the cuts, so they cover the domain exactly; each must be either closed or waiting.
-* The level is computed from the counterexample, which is evaluated again.
+* The level is computed from the counterexample, at which the condition is evaluated again.
 * The leaves of a finished proof are bounded again.
 
-Someone who edits an unfinished proof and its digest can still list a waiting leaf as closed. Resuming relies on the
-digest; `lyapnet certify check` does not use the two lists, but bounds every leaf.
+Someone who edits an unfinished proof and its digest can still list a waiting leaf as closed, and a search that
+continues from it would believe that. `lyapnet certify check` does not: it bounds every leaf.
 """
 
 import hashlib
@@ -43,14 +43,14 @@ from lyapnet.task.cost import control_costs, minimum
 SOURCES = (Path(__file__).parent,)
 """The folder whose code a proof depends on: the search, the bounds and their kernel.
 
-f, g, ℓ, V, u and the code that assembles c from them are not listed: the fingerprint of the traced function contains
-all their operations and numbers. The file of the tracing is hashed too, because it merges equal operations, and those
-of costs and sets of controls, whose minimum is one operation.
+f, g, ℓ, V, u and the code that assembles c from them are not in it: the fingerprint of the traced function contains all
+their operations and numbers. hash_of_sources adds the file of the tracing, which merges equal operations, and those of
+costs and sets of controls, whose minimum is a single operation in a trace.
 """
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
-    """A hash of the code in the folders and of the tracing, compiler flags, torch's version and own operators."""
+    """A hash of the code in the folders and of the tracing, compiler flags, torch's version and users' operators."""
     found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
     for file in (tracing.__file__, ball.__file__, control_costs.__file__, minimum.__file__, sets.__file__):
         found.update(Path(str(file)).read_bytes())
@@ -72,11 +72,11 @@ class ProofState(NamedTuple):
 
     @property
     def proved(self) -> float:
-        """The level up to which c ≤ 0 is proved: undecided boxes have W ≥ search.least."""
+        """The level up to which c ≤ 0 is proved: on all undecided boxes W ≥ search.least."""
         return min(self.level, just_below(self.search.least))
 
 
-def about(bounded: Bounds, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
+def describe_condition(bounded: Bounds, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
     """What a proof is about, as plain data."""
     box = {"lower": lower.tolist(), "upper": upper.tolist(), "degree": bounded.degree}
     return {"proves": condition.proves, "fingerprint": bounded.fingerprint, **box, **condition.facts}
@@ -94,10 +94,10 @@ TWO_SIDED = {"above", "below"}
 
 @dataclass
 class KeptProof:
-    """The file of a proof of one condition on one box up to one level, by this version's code.
+    """The file of the proof of one condition on one box up to one level, by the code of this version.
 
     Args:
-        about: what is proved, as plain data; see the function `about`.
+        about: what is proved, as plain data, from describe_condition.
         wanted: the level up to which the condition is to be proved.
     """
 
@@ -110,7 +110,7 @@ class KeptProof:
 
     @property
     def identity(self) -> list[Any]:
-        """The condition, the wanted level and a hash of the code: other code might not prove the closed boxes."""
+        """The condition, the wanted level and a hash of the code, since other code might not prove the closed boxes."""
         return [self.about, self.wanted, hash_of_sources()]
 
     def write(self, proof: ProofState) -> None:
@@ -132,7 +132,7 @@ class KeptProof:
         """The state of the proof in the file; None if there is none yet.
 
         Args:
-            level: counterexample ↦ level of the proof; it raises ValueError if the counterexample is none.
+            level: counterexample or None ↦ level of the proof; raises ValueError if the condition holds at that point.
 
         Raises:
             UsageError: the file holds something else.
@@ -140,8 +140,8 @@ class KeptProof:
         name = self.about["proves"]
         if name not in self._proofs and {name, *self._proofs} <= {name} | TWO_SIDED:
             return None
-        content = part_of(self._proofs, name, self.path, "take a new file")
-        with refusing(self.path):
+        content = select_proof(self._proofs, name, self.path, "take a new file")
+        with refuse_bad_file(self.path):
             if content["of"] != self.identity:
                 raise UsageError(
                     f"Expected the proof of this V, set and version by the same options in {str(self.path)!r}, got "
@@ -160,13 +160,13 @@ class KeptProof:
             waiting = leaves[place[frontier]]._replace(key=key.double())
             if len(key) != len(frontier) or not bool((key <= reached).all()):
                 raise ValueError("a waiting leaf has a key above the level")
-            finished = not len(frontier)  # all leaves of a finished proof are bounded again
-            given_up = float("inf") if finished else content["given_up"]
+            finished = not len(frontier)
+            given_up = float("inf") if finished else content["given_up"]  # given-up boxes are leaves, bounded again
             search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
             return ProofState(search, reached, worst, content["seconds"])
 
-    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> ProofState:
-        """The claim of a kept proof: all leaves, undecided, and the level that it says is proved.
+    def read_claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> ProofState:
+        """What a kept proof claims, to be checked: all its leaves as undecided boxes, and the level that it states.
 
         Args:
             partial: accept an unfinished proof too, with the level that it has reached.
@@ -175,8 +175,8 @@ class KeptProof:
             UsageError: the file holds another proof, an unfinished one, or none.
         """
         name = self.about["proves"]
-        content, kind = part_of(self._proofs, name, self.path), name if name in ("noisy", "reach") else "sound"
-        with refusing(self.path):
+        content, kind = select_proof(self._proofs, name, self.path), name if name in ("noisy", "reach") else "sound"
+        with refuse_bad_file(self.path):
             if content["of"][:1] != [self.about]:
                 raise UsageError(
                     f"Expected the proof of this V, by the options that it names, in {str(self.path)!r}, got another; "
@@ -192,13 +192,13 @@ class KeptProof:
         return claimed
 
 
-def part_of(proofs: dict[str, Any], name: str, path: Path, remedy: str = "name another") -> dict[str, Any]:
-    """The proof of that name among the proofs of a file.
+def select_proof(proofs: dict[str, Any], name: str, path: Path, remedy: str = "name another") -> dict[str, Any]:
+    """The proof of this name among the proofs of a file.
 
     Raises:
-        UsageError: there is none; the message lists those that exist.
+        UsageError: there is none; the message lists the existing ones.
     """
-    with refusing(path):
+    with refuse_bad_file(path):
         if name not in proofs:
             raise UsageError(
                 f"Expected the proof of {DESCRIPTIONS[name]} in {str(path)!r}, got that of "
@@ -221,7 +221,7 @@ def read_proofs(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: there is no such file, it has another format, or it was changed since it was written.
     """
-    with refusing(path):
+    with refuse_bad_file(path):
         content = read_file(path)
         start = len(FORMAT) + hashlib.sha256().digest_size
         head, payload = content[:start], content[start:]
@@ -239,7 +239,7 @@ def read_proofs(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def refusing(path: Path) -> Iterator[None]:
+def refuse_bad_file(path: Path) -> Iterator[None]:
     """A context that turns every exception into a UsageError that names the file; a UsageError passes unchanged."""
     try:
         yield

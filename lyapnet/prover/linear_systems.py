@@ -1,4 +1,4 @@
-"""Rules for small linear systems whose matrix depends on the point."""
+"""Bounds of A⁻¹B for small matrices that depend on the point."""
 
 from typing import Any
 
@@ -41,7 +41,7 @@ def _columns(x: TaylorForm, columns: slice) -> TaylorForm:
     return x.with_parts(x.terms[..., columns], x.radius[..., columns])
 
 
-def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) -> list[Any]:
+def _solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) -> list[Any]:
     """A⁻¹B; the other results of torch (LU factors, pivots, the code for a singular A) have no bounds."""
     if not left:
         raise UsageError("Expected a linear system A y = b, got y A = b; transpose it.")
@@ -54,7 +54,7 @@ def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) ->
     return [solution, None, None, None]
 
 
-def inverse_rule(A: TaylorForm, check_errors: bool = False) -> list[Any]:
+def _inverse_rule(A: TaylorForm, check_errors: bool = False) -> list[Any]:
     """A⁻¹; the code for a singular A has no bounds."""
     identity = taylor.constant_form(torch.eye(A.shape[0]).to(A.radius), A)
     return [solve(A, identity), None]
@@ -66,4 +66,4 @@ def _forms(A: Any, B: Any) -> tuple[TaylorForm, TaylorForm]:
     return A, B
 
 
-LINEAR_SYSTEMS = {aten._linalg_solve_ex.default: solve_rule, aten.linalg_inv_ex.default: inverse_rule}
+LINEAR_SYSTEMS = {aten._linalg_solve_ex.default: _solve_rule, aten.linalg_inv_ex.default: _inverse_rule}

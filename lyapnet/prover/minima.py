@@ -1,21 +1,21 @@
-"""Bounds of min over u ∈ U of uᵀWu + bᵀu + s(u) and of the u where it is: the rule of lyapnet.task.cost.minimum.
+"""Bounds of h = min over u ∈ U of uᵀWu + bᵀu + s(u) and of its minimiser u: the rule of lyapnet.task.cost.minimum.
 
-The minimum h(b) is concave and u(b) its slope, so that
+The minimum h(b) is concave, and its slope is u(b). With the means D and D' of the derivative u_b on the line from b₀
+to b,
 
-    u(b) = u(b₀) + D(b − b₀),     h(b) = h(b₀) + u(b₀)ᵀ(b − b₀) + ½ (b − b₀)ᵀD'(b − b₀)
+    u(b) = u(b₀) + D(b − b₀),     h(b) = h(b₀) + u(b₀)ᵀ(b − b₀) + ½ (b − b₀)ᵀD'(b − b₀).
 
-with means D and D' of the derivative u_b on the way from b₀ to b. u_b is symmetric, and −(2W)⁻¹ ≤ u_b ≤ 0, for every
-convex s and U. Two cases are known more closely, on a box of b:
+u_b is symmetric, and −(2W)⁻¹ ≤ u_b ≤ 0 for every convex s and U. In two cases u_b has tighter bounds on a box of b:
 
-* Each control by itself, for a diagonal W, costs Σ σᵢ(uᵢ) and limits: u_b is −1/(2Wᵢᵢ + σᵢ''(uᵢ)), or 0 in the kink of
-  |uᵢ| and at a limit. The curvature of all of lyapnet's costs is monotone in |u|.
-* ‖u‖ and a ball, for W a multiple of the identity: u is −b by a function of ‖b‖.
+* W is diagonal, the costs are Σ σᵢ(uᵢ) and U has limits of each control: u_b is diagonal with −1/(2Wᵢᵢ + σᵢ''(uᵢ)), or
+  0 in the kink of |uᵢ| and at a limit. The curvature σᵢ'' of all of lyapnet's costs is monotone in |u|.
+* W is a multiple of the identity, s = w‖u‖ and U is a ball: u is −b times a function of ‖b‖.
 
 If W depends on the point too, W = W₀ + Δ, then u is the minimiser for W₀ and b + 2Δu, and |h − h₀| ≤ max |uᵀΔu|.
 
-The law computes u by Newton's method. It is taken to be as exact as this: u is FORWARD · |u| from the minimiser for a b
-that is off by BACKWARD of the size of b and 2Wu. At the centre of each box that is checked, by the conditions of an
-optimum; a box where it does not hold has no bounds.
+The law computes u by Newton's method. Its u is assumed to differ by at most FORWARD · |u| from the minimiser for a b
+that differs by at most BACKWARD (|b| + |2Wu| + w). At the centre of each box, the optimality conditions verify this;
+boxes where they fail have no bounds.
 
 Sources: Rockafellar, Convex Analysis, 1970, § 23, 26 (conjugates); Bauschke, Combettes, Convex Analysis and Monotone
 Operator Theory in Hilbert Spaces, 2017, § 4 (firmly nonexpansive maps).
@@ -31,7 +31,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import apply
 from lyapnet.prover import taylor
 from lyapnet.prover.branches import relu
-from lyapnet.prover.closed_minima import TIED, closed_minimum
+from lyapnet.prover.closed_minima import TIE, closed_minimum
 from lyapnet.prover.elementary_functions import Elementary, square
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
@@ -41,12 +41,12 @@ from lyapnet.task.sets import ControlSet, Unbounded
 
 Vectors = Float[Tensor, "boxes m"]
 Matrices = Float[Tensor, "boxes m m"]
-FORWARD, BACKWARD = 1e-10, 1e-9  # see above; float64 has 1e-16, which R of a condition of 1e5 makes 1e-11
-ROOM = 1e-9  # of a slope, for the rounding of its bounds
+FORWARD, BACKWARD = 1e-10, 1e-9  # see above; rounding of 1e-16 gives 1e-11 where W has the condition number 1e5
+ROOM = 1e-9  # relative widening of computed bounds, far above their rounding errors
 
 
 class _Program(NamedTuple):
-    """min over u ∈ U of uᵀWu + bᵀu + s(u), a set of them for each box: |b − middle| ≤ reach."""
+    """The problems min over u ∈ U of uᵀWu + bᵀu + s(u) with |b − middle| ≤ reach, for each box."""
 
     costs: ControlCosts | None  # s
     controls: ControlSet  # U
@@ -56,14 +56,14 @@ class _Program(NamedTuple):
     size: Vectors  # a bound of |uᵢ|
 
     @property
-    def radial(self) -> bool:
-        """Whether s and U look at ‖u‖ alone. Those of a single control are kinks and limits."""
+    def is_radial(self) -> bool:
+        """Whether s and U depend on ‖u‖ alone; false for a single control, which has kinks and limits."""
         ball = isinstance(self.controls, ControlBall) or (self.costs is not None and bool(self.costs.norms))
         return ball and self.middle.shape[-1] > 1
 
     @property
     def kinks(self) -> Tensor:
-        """w of s = w‖u‖ + …, or of s = Σ wᵢ|uᵢ| + …, (m,)."""
+        """w, (m,), of s = w‖u‖ + … or s = Σ wᵢ|uᵢ| + …"""
         kinked = [] if self.costs is None else self.costs.kinked
         return sum((cost.weight for cost in kinked), self.middle.new_zeros(self.middle.shape[-1]))
 
@@ -85,11 +85,11 @@ class _Program(NamedTuple):
 
     @property
     def forces(self) -> Vectors:
-        """A bound of |b| + |2Wu| + w, the slopes that balance at the minimum."""
+        """A bound of |b| + |2Wu| + w, the terms whose sum is 0 at a minimum inside U."""
         return 2 * apply(self.W.abs(), self.size) + self.middle.abs() + self.reach + self.kinks
 
     def slope(self, u: Vectors, side: int) -> Vectors:
-        """The slope of s on one side of u, −1 or 1, where each control costs by itself; ±∞ at a limit."""
+        """The one-sided derivative of Σ σᵢ(uᵢ), to the left (side −1) or right (1) of u; ±∞ at a limit."""
         low, high = self.limits
         total = self.kinks * torch.where(side * u >= 0, side, -side)
         for cost in self.smooth:
@@ -98,7 +98,7 @@ class _Program(NamedTuple):
 
 
 def _inside(cost: SeparableCost, name: str, u: Vectors, beyond: Any) -> Vectors:
-    """A method of a cost; another value from its open limit on, if there is one."""
+    """A method of a cost, as `slope`, at u; `beyond` where |u| reaches the open limit of the cost, if it has one."""
     end = cost.open_limit
     if end is None:
         return getattr(cost, name)(u)
@@ -107,7 +107,7 @@ def _inside(cost: SeparableCost, name: str, u: Vectors, beyond: Any) -> Vectors:
 
 
 def least(W: Any, b: Any, named: str) -> TaylorForm:
-    """(u, h), (m + 1,), of the s and the U with this description.
+    """Bounds of (u, h), (m + 1,), for the s and U that `named` describes.
 
     Args:
         W: (m, m), a form or constant.
@@ -129,21 +129,21 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
     middle = torch.where(known, b.center, 0.0)
     reach = torch.where(known, torch.maximum(high - middle, middle - low), 1.0)
     W, spread, definite = _matrices(W, b)
-    program = _Program(costs, controls, W, middle, reach, _sizes(controls, W, spread, middle.abs() + reach))
+    program = _Program(costs, controls, W, middle, reach, _bound_sizes(controls, W, spread, middle.abs() + reach))
     u, value = least_over(costs, controls, W, middle)
     forces = program.forces
     found = _is_minimum(program, u, BACKWARD * forces)
     off = 2 * BACKWARD * forces + 2 * (1 + ROOM) * apply(spread, program.size)
     far, near = reach + off, FORWARD * program.size
-    D, doubt = _slopes(program._replace(reach=far))
+    D, doubt = _bound_slopes(program._replace(reach=far))
     y = b.with_parts(torch.cat([torch.zeros_like(b.terms[:1]), b.terms[1:]]), b.radius)
     Dy = _linear(D, y)
-    radius = Dy.radius + apply(D.abs(), off) + apply(doubt, far) + 2 * near + _ties(program)
+    radius = Dy.radius + apply(D.abs(), off) + apply(doubt, far) + 2 * near + _tie_errors(program)
     law = Dy.with_parts(torch.cat([u[None], Dy.terms[1:]]), radius * (1 + ROOM)).with_rounding()
     curved, straight = taylor.multiply(y, Dy), y.with_parts(y.terms * u, y.radius * u.abs()).with_rounding()
     h = taylor.add(straight, curved.with_parts(curved.terms / 2, curved.radius / 2)).with_rounding(len(u[0]))
     error = far * apply(doubt, far) / 2 + program.size * apply(spread, program.size)
-    error = error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + TIED * program.size) * forces
+    error = error + 4 * BACKWARD * forces * apply(D.abs() + doubt, far) + 2 * (near + TIE * program.size) * forces
     terms, radius = h.terms.sum(-1, keepdim=True), (h.radius + error * (1 + ROOM)).sum(-1, keepdim=True)
     h = h.with_parts(torch.cat([terms[:1] + value[:, None], terms[1:]]), radius).with_rounding()
     terms, radius = torch.cat([law.terms, h.terms], -1), torch.cat([law.radius, h.radius], -1)
@@ -189,7 +189,7 @@ class _ByForms:
 
 
 def _within_ball(v: Tensor) -> Tensor:
-    """v up to 1, and 2√v − 1 beyond."""
+    """v for v ≤ 1, else 2√v − 1."""
     return torch.where(v > 1, 2 * v.clamp_min(1).sqrt() - 1, v)
 
 
@@ -206,7 +206,7 @@ FUNCTIONS = {
         lambda a, lo, hi: [torch.ones_like(a), (4 * a * a) ** (-1 / 3)],
     ),
 }
-"""The functions of closed forms, by their names in machine code."""
+"""Name of a function of closed forms, as in machine code ↦ its rule."""
 
 
 def is_minimum(
@@ -215,15 +215,17 @@ def is_minimum(
     """Whether u is the minimiser, up to FORWARD and BACKWARD.
 
     Args:
-        costs, controls: s and U; s is None for zero.
-        W, b, u: of a batch with one axis.
+        costs, controls: s and U; None means s = 0.
+        W, b, u: (boxes, m, m), (boxes, m) and (boxes, m).
     """
-    program = _Program(costs, controls, W, b, torch.zeros_like(b), _sizes(controls, W, torch.zeros_like(W), b.abs()))
+    program = _Program(
+        costs, controls, W, b, torch.zeros_like(b), _bound_sizes(controls, W, torch.zeros_like(W), b.abs())
+    )
     return _is_minimum(program, u, BACKWARD * program.forces)[..., 0]
 
 
 def _matrices(W: Any, like: TaylorForm) -> tuple[Matrices, Matrices, Tensor]:
-    """(W₀, a bound of |W − W₀|, whether W is positive definite on the box (boxes, 1)); where it is not, W₀ is 1."""
+    """(W₀, a bound of |W − W₀|, whether W is positive definite on the box (boxes, 1)); if not, W₀ is 1."""
     boxes, m = like.radius.shape
     if isinstance(W, TaylorForm):
         center, spread = W.center, W.spread + W.radius + 4 * len(W.terms) * EPSILON * W.magnitude
@@ -234,26 +236,26 @@ def _matrices(W: Any, like: TaylorForm) -> tuple[Matrices, Matrices, Tensor]:
     finite = (center.isfinite() & spread.isfinite()).all((-2, -1), keepdim=True)
     one = torch.eye(m).to(middle)
     middle, spread = torch.where(finite, middle, one), torch.where(finite, spread, 0.0)
-    definite = finite & (_stiffness(middle, spread)[..., None] > 0)
+    definite = finite & (_least_eigenvalue(middle, spread)[..., None] > 0)
     return torch.where(definite, middle, one), torch.where(definite, spread, 0.0), definite[..., 0]
 
 
-def _stiffness(W: Matrices, spread: Matrices) -> Float[Tensor, "boxes 1"]:
+def _least_eigenvalue(W: Matrices, spread: Matrices) -> Float[Tensor, "boxes 1"]:
     """A lower bound of the least eigenvalue of W, (boxes, 1)."""
     size = torch.linalg.matrix_norm(W)
     return (torch.linalg.eigvalsh(W)[..., 0] - 1e-12 * size - torch.linalg.matrix_norm(spread) * (1 + ROOM))[:, None]
 
 
-def _sizes(controls: ControlSet, W: Matrices, spread: Matrices, b: Vectors) -> Vectors:
-    """A bound of |uᵢ|: its limits; and ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W, if U contains 0.
+def _bound_sizes(controls: ControlSet, W: Matrices, spread: Matrices, b: Vectors) -> Vectors:
+    """A bound of |uᵢ|, from its limits and, if U contains 0, from ‖u‖ ≤ ‖b‖/(2λ) with the least eigenvalue λ of W.
 
     Args:
-        b: bounds of |b|.
+        b: a bound of |b|.
     """
-    free = b.norm(dim=-1, keepdim=True) * (1 + ROOM) / (2 * _stiffness(W, spread))
+    free = b.norm(dim=-1, keepdim=True) * (1 + ROOM) / (2 * _least_eigenvalue(W, spread))
     diagonal = W.diagonal(dim1=-2, dim2=-1)
     if not bool((W - torch.diag_embed(diagonal)).any()) and not bool(spread.any()):
-        free = b * (1 + ROOM) / (2 * diagonal)  # of each control by itself, and less in a ball
+        free = b * (1 + ROOM) / (2 * diagonal)  # |uᵢ| without limits; a ball makes it smaller
     if controls.limits is None:
         return free.expand_as(b)
     low, high = (side.to(b) for side in controls.limits)
@@ -263,15 +265,15 @@ def _sizes(controls: ControlSet, W: Matrices, spread: Matrices, b: Vectors) -> V
 
 
 def _linear(D: Matrices, y: TaylorForm) -> TaylorForm:
-    """Dy with a matrix D for each box."""
+    """D y with one matrix D for each box."""
     y = y.with_rounding(2 * D.shape[-1])  # as in taylor.matrix_product
     return y.with_parts(apply(D, y.terms), apply(D.abs(), y.radius) + TINY)
 
 
 def _is_minimum(program: _Program, u: Vectors, tolerance: Vectors) -> Tensor:
-    """Whether u is the minimiser for b in the middle, up to FORWARD and BACKWARD, (boxes, 1)."""
+    """Whether u is the minimiser for b = middle, up to FORWARD · |u| in u and `tolerance` in b, (boxes, 1)."""
     near, slope = FORWARD * program.size, 2 * apply(program.W, u) + program.middle
-    if not program.radial:
+    if not program.is_radial:
         bend = 2 * program.W.diagonal(dim1=-2, dim2=-1) * near
         above, below = slope + bend + program.slope(u + near, 1), slope - bend + program.slope(u - near, -1)
         (low, high) = program.limits
@@ -287,16 +289,16 @@ def _is_minimum(program: _Program, u: Vectors, tolerance: Vectors) -> Tensor:
     return torch.where(still, program.middle.norm(dim=-1, keepdim=True) <= w + most, moving)
 
 
-def _ties(program: _Program) -> Vectors:
-    """An error of u where costs |u| are minimised in each orthant: see lyapnet.prover.closed_minima."""
-    if program.radial or len(program.kinks) == 1 or not bool(program.kinks.any()):
+def _tie_errors(program: _Program) -> Vectors:
+    """The error of u, for costs Σ wᵢ|uᵢ|, from orthants with nearly equal minima: see lyapnet.prover.closed_minima."""
+    if program.is_radial or len(program.kinks) == 1 or not bool(program.kinks.any()):
         return torch.zeros_like(program.middle)
-    hidden = TIED * (program.size * program.forces).sum(-1, keepdim=True)
+    hidden = TIE * (program.size * program.forces).sum(-1, keepdim=True)
     return (torch.linalg.inv(program.W).diagonal(dim1=-2, dim2=-1).clamp_min(0) * hidden).sqrt() * (1 + ROOM)
 
 
-def _slopes(program: _Program) -> tuple[Matrices, Matrices]:
-    """(D, a bound of |u_b − D|) on the box, (boxes, m, m) each."""
+def _bound_slopes(program: _Program) -> tuple[Matrices, Matrices]:
+    """(D, a bound of |u_b − D|) for all b of the box, (boxes, m, m) each."""
     W, diagonal = program.W, program.W.diagonal(dim1=-2, dim2=-1)
     if program.is_diagonal:
         G = torch.diag_embed(1 / (2 * diagonal))
@@ -307,17 +309,17 @@ def _slopes(program: _Program) -> tuple[Matrices, Matrices]:
     across = root[..., :, None] * root[..., None, :]
     low, high = -(G + across) / 2, (across - G) / 2
     closer = None
-    if program.is_diagonal and not program.radial:
-        closer = tuple(map(torch.diag_embed, _slopes_of_each(program, 2 * diagonal)))
+    if program.is_diagonal and not program.is_radial:
+        closer = tuple(map(torch.diag_embed, _bound_slopes_of_each(program, 2 * diagonal)))
     elif program.is_diagonal and not bool((diagonal != diagonal[..., :1]).any()):
-        closer = _slopes_of_radius(program, 2 * diagonal[..., 0])
+        closer = _bound_slopes_of_radius(program, 2 * diagonal[..., 0])
     if closer is not None:
         low, high = torch.maximum(low, closer[0]), torch.minimum(high, closer[1])
     room = ROOM * across
     return (low + high) / 2, (high - low) / 2 + room
 
 
-def _slopes_of_each(program: _Program, bend: Vectors) -> tuple[Vectors, Vectors]:
+def _bound_slopes_of_each(program: _Program, bend: Vectors) -> tuple[Vectors, Vectors]:
     """The range of ∂uᵢ/∂bᵢ = −1/(rᵢ + σᵢ''(uᵢ)) for a diagonal W, (boxes, m) each.
 
     Args:
@@ -337,34 +339,31 @@ def _slopes_of_each(program: _Program, bend: Vectors) -> tuple[Vectors, Vectors]
     steep, mild = -1 / (bend + flat), -1 / (bend + sharp)
     still, may_be = torch.zeros_like(bend, dtype=torch.bool), torch.zeros_like(bend, dtype=torch.bool)
     w = program.kinks
-    for start, end in ((-w, w), *_at_limits(program, bend)):  # intervals of b on which u is constant
+    for start, end in ((-w, w), *_intervals_at_limits(program, bend)):  # u is constant for b in these intervals
         room = ROOM * torch.maximum(start.abs().nan_to_num(0, 0, 0), end.abs().nan_to_num(0, 0, 0))
         still = still | ((b_low >= start + room) & (b_high <= end - room) & (end > start))
         may_be = may_be | ((b_low <= end + room) & (b_high >= start - room) & (end > start))
     return torch.where(still, 0.0, steep), torch.where(may_be, 0.0, mild)
 
 
-def _at_limits(program: _Program, bend: Vectors) -> list[tuple[Vectors, Vectors]]:
-    """The intervals of b, (boxes, m) each, on which u is at its upper and at its lower limit."""
+def _intervals_at_limits(program: _Program, bend: Vectors) -> list[tuple[Vectors, Vectors]]:
+    """The intervals of b on which u is at its upper and at its lower limit, as (start, end), (boxes, m) each."""
     low, high = program.limits
     free = program._replace(controls=Unbounded())
-    ends = list[tuple[Vectors, Vectors]]()
-    everywhere = torch.full_like(bend, torch.inf)
+    infinity = torch.full_like(bend, torch.inf)
     upper, lower = high.expand_as(bend), low.expand_as(bend)
     at_upper = torch.where(upper.isfinite(), -(bend * upper + free.slope(upper, -1)), -torch.inf)
     at_lower = torch.where(lower.isfinite(), -(bend * lower + free.slope(lower, 1)), torch.inf)
-    ends.append((-everywhere, at_upper))
-    ends.append((at_lower, everywhere))
-    return ends
+    return [(-infinity, at_upper), (at_lower, infinity)]
 
 
-def _slopes_of_radius(program: _Program, bend: Float[Tensor, " boxes"]) -> tuple[Matrices, Matrices]:
+def _bound_slopes_of_radius(program: _Program, bend: Float[Tensor, " boxes"]) -> tuple[Matrices, Matrices]:
     """The range of u_b for u = −b a(β)/β, β = ‖b‖, a = min(max(β − w, 0)/r, radius), (boxes, m, m) each:
 
         u_b = −a/β + (a/β − a') n nᵀ,     n = b/β.
 
     Args:
-        bend: r, W being r/2 times the identity.
+        bend: r; W is r/2 times the identity.
     """
     w, radius = program.kinks[0], program.limits[1][0]
     b_low, b_high = program.middle - program.reach, program.middle + program.reach
@@ -399,7 +398,7 @@ def _slopes_of_radius(program: _Program, bend: Float[Tensor, " boxes"]) -> tuple
 
 
 def _direction(b: Vectors, others: Vectors) -> Vectors:
-    """bᵢ/√(bᵢ² + others), and ±1 without others."""
+    """bᵢ/√(bᵢ² + others), a component of b/‖b‖, where others is Σ_{j≠i} b_j²."""
     return b / (b * b + others).sqrt().clamp_min(TINY)
 
 

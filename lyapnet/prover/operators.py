@@ -1,7 +1,7 @@
-"""Registration of an operator: its row in the table of operators, and its bounds.
+"""Registration of users' operators: a row of the table of operators, and its bounds.
 
-The row (lyapnet.graphs.operators) serves numbers, C, JavaScript and CasADi. Bounds are registered here, not in the row,
-because a kept proof depends on the code of this folder and on the files that register bounds (`files`).
+The row (lyapnet.graphs.operators) says how numbers, C, JavaScript and CasADi compute the operator. Bounds are not part
+of the row, because a kept proof depends on the code of this folder and on the files that register bounds (`files`).
 """
 
 import os
@@ -21,17 +21,17 @@ from lyapnet.prover.bound_kernel import writing
 from lyapnet.prover.bound_rules import RULES
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.branches import JUMPS, KINKS
-from lyapnet.prover.composed_rules import in_programs, on_forms
+from lyapnet.prover.composed_rules import for_forms, for_programs
 from lyapnet.prover.elementary_functions import Elementary
 from lyapnet.prover.taylor import TaylorForm, monomials
 
 Bound = Elementary | Callable[..., Any]
 
-BOXES, POINTS = 40, 40  # numbers of boxes, and of points in each, at which bounds are compared with values
-TOLERANCE = 1e-7  # largest difference of a derivative from torch's, relative to max(1, |derivative|)
+BOXES, POINTS = 40, 40  # number of boxes whose bounds are compared with values, and of points in each
+TOLERANCE = 1e-7  # largest difference of two derivatives that should be equal, relative to 1 + |derivative|
 
 KINDS: dict[str, dict[Any, Any]] = {"smooth": {}, "kink": KINKS, "jump": JUMPS}
-_files = dict[str, list[bytes]]()  # name of a row ↦ contents of the files that registered its bounds
+_files = dict[str, list[bytes]]()  # name of a row ↦ contents of the files that define and register its bounds
 
 
 def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", "kink", "jump"] = "smooth") -> None:
@@ -45,7 +45,7 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         kind: "smooth" if the derivative exists everywhere, "kink" if it jumps, "jump" if the function itself jumps.
 
     Raises:
-        UsageError: the table has the row already, or torch lacks the operator; or a value lies outside its bounds.
+        UsageError: the table has the row already; torch lacks the operator; or a check finds the bounds wrong.
     """
     if kind not in KINDS:
         raise UsageError(f"Expected kind as one of {', '.join(KINDS)}, got {kind!r}; choose one.")
@@ -59,7 +59,7 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         raise UsageError(f"Expected an operator without bounds, got {row.name}.")
     if bound is None:
         return
-    with ExitStack() as undo:  # removes the rule unless its check succeeds, after Ctrl-C too
+    with ExitStack() as undo:  # the registration is undone unless its check succeeds, also after Ctrl-C
         undo.callback(forget, row, is_new)
         try:
             _add_bounds(row, bound, kind)
@@ -79,15 +79,15 @@ def _add_bounds(row: Operator, bound: Bound, kind: str) -> None:
     """Add rules for bounds of all overloads of a row."""
     for overload in row.overloads:
         composed = not isinstance(bound, Elementary)
-        rule = on_forms(bound, RULES) if composed else bound
+        rule = for_forms(bound, RULES) if composed else bound
         for rules in (RULES, KINDS[kind]):
             rules[overload] = rule
         if composed:
-            writing.RULES[overload] = in_programs(bound, writing.RULES)
+            writing.RULES[overload] = for_programs(bound, writing.RULES)
 
 
 def _files_of(bound: Bound) -> Iterator[Path]:
-    """The files that define the functions of a bound."""
+    """The files in which the functions of a bound are defined."""
     parts = vars(bound).values() if isinstance(bound, Elementary) else [bound]
     for part in [*parts, *(getattr(bound, "derivatives", None) or ())]:
         code = getattr(part, "__code__", None)
@@ -96,7 +96,7 @@ def _files_of(bound: Bound) -> Iterator[Path]:
 
 
 def _content(file: Path) -> bytes:
-    """The content of a file; for code typed at a prompt, random bytes, so that no other process has the same hash."""
+    """The content of a file; for code typed at a prompt random bytes, so that kept proofs refuse other processes."""
     return file.read_bytes() if file.is_file() else os.urandom(16)
 
 
@@ -111,7 +111,7 @@ def forget(row: Operator, is_new: bool = True) -> None:
 
 
 def files() -> list[bytes]:
-    """The content of each file that has registered bounds; random bytes for code typed at a prompt."""
+    """The contents of all files that define and register bounds; random bytes for code typed at a prompt."""
     return [content for contents in _files.values() for content in contents]
 
 
@@ -121,7 +121,7 @@ def has_bounds(row: Operator) -> bool:
 
 
 def complaints(row: Operator) -> Iterator[str]:
-    """Errors in the bounds of a row: values outside on random boxes of its domain, and wrong parts of an Elementary."""
+    """Errors in the bounds of a row: values outside on random boxes of its domain; wrong parts of an Elementary."""
     rule = RULES[row.overloads[0]]
     if isinstance(rule, Elementary):
         yield from _wrong_parts(row, rule)
@@ -141,8 +141,8 @@ def complaints(row: Operator) -> Iterator[str]:
         for form, *_ in [bounded.forms(lower, upper), *([] if kernel is None else [kernel.forms(lower, upper)])]:
             if not form.radius.isfinite().any():
                 yield f"no finite bounds in forms of degree {degree}"
-            room = form.radius * (1 + 1e-9) + 1e-13 * form.magnitude  # for the rounding of this check
-            inside = (values - _at(form, points, lower, upper)).abs() <= room  # false if one of them is nan
+            room = form.radius * (1 + 1e-9) + 1e-13 * form.magnitude  # for the rounding errors of this check
+            inside = (values - _at(form, points, lower, upper)).abs() <= room  # false for nan
             outside = int((~inside).sum())
             if outside:
                 yield f"{outside} of {values.numel()} values outside, in forms of degree {degree}"

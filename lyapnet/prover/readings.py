@@ -1,4 +1,4 @@
-"""Laws that are read at times and held: when they are read, how far what is read may be off, and closed loops then."""
+"""Control laws that are evaluated at certain times, by readings, and held in between: assumptions and simulations."""
 
 import math
 from collections.abc import Sequence
@@ -10,17 +10,19 @@ import torch
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 
-STEPS, RUNS = 2, 3  # of a simulation after a reading; simulations from each reading, if there are errors
+SIMULATION_STEPS = 2  # Runge-Kutta steps from a reading to the time of interest
+SIMULATED_RUNS = 3  # simulations from each reading if there are errors: one without errors, the others with random ones
 
 
 @dataclass(frozen=True)
 class Computed:
-    """That a program computes the law in floating-point numbers, and how far it is off (lyapnet.prover.float_errors).
+    """A program that computes the law in floating-point numbers, with its errors (lyapnet.prover.float_errors).
 
     Args:
-        sha256: of its file.
-        precision: float32 or float64.
-        errors: the largest |ũ_j − u_j| of each control, in its unit, (m,), for readings up to `latest`, in s.
+        sha256: hash of its file.
+        precision: "float32" or "float64".
+        errors: the largest |ũ_j − u_j| of each control, in its unit, (m,), for readings at t ≤ latest.
+        latest: in s.
     """
 
     sha256: str
@@ -31,18 +33,19 @@ class Computed:
 
 @dataclass(frozen=True)
 class Readings:
-    """When a law is read, and how far what is read and what is given may be off.
+    """How often a control law is read, the delay until its control is used, and the errors of states and controls.
 
-    A control u = policy(t̂, x(t̂) + e) + r is used from t̂ + d on, 0 ≤ d ≤ delay, until the next one is, and so until
-    interval + delay after t̂ at most. Controls are used in the order of their readings, that of t̂ = 0 at once.
+    A reading at t̂ gives the control u = policy(t̂, x(t̂) + e) + r. It is used from t̂ + d on, 0 ≤ d ≤ delay, until the
+    control of the next reading is used, which is at most interval + delay after t̂. Controls are used in the order of
+    their readings; that of t̂ = 0 is used at once.
 
     Args:
         interval: the longest time between two readings, in s.
         delay: the longest time from a reading to the use of its control, in s.
         errors: the largest |e_i| of each measured state, in its unit, (n,).
         control_errors: the largest |r_j| of each control, in its unit, (m,).
-        duration: T in s; None for a law that is read as u(0, x), at every time and for ever.
-        computed: the program that computes the law, whose errors are among the control_errors; None: real numbers.
+        duration: T in s; None for a receding law u = policy(0, x), used without end.
+        computed: the program that computes the law, whose errors control_errors contains; None for real numbers.
     """
 
     interval: float
@@ -54,37 +57,37 @@ class Readings:
 
     @property
     def receding(self) -> bool:
-        """Whether the law is read as u(0, x)."""
+        """Whether the law is policy(0, x), without end."""
         return self.duration is None
 
     @property
     def facts(self) -> dict[str, Any]:
         """The numbers as plain data."""
-        return asdict(self, dict_factory=_listed)
+        return asdict(self, dict_factory=_plain_fields)
 
     @property
     def longest(self) -> float:
-        """The longest time from a reading to the end of the use of its control, in s."""
+        """The longest time from a reading to the end of the use of its control, in s, rounded upwards."""
         return self.interval + self.delay if not self.delay else math.nextafter(self.interval + self.delay, math.inf)
 
     def control(self, loop: ClosedLoop, t: Time, x: State, e: State, r: Control) -> Control:
-        """The control of a reading at (t, x)."""
+        """The control of a reading at (t, x), with the errors e of the state and r of the control."""
         return loop.policy(torch.zeros_like(t) if self.receding else t, x + e) + r
 
     def span(self, t: Time) -> Time:
-        """The longest time in s from a reading at t to the end of the use of its control: at most up to T."""
+        """The longest time in s from a reading at t to the end of the use of its control, which is at most T."""
         span = torch.full_like(t, self.longest)
         return span if self.duration is None else torch.minimum(span, self.duration - t)
 
 
-def _listed(items: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Fields by name, with lists for tuples; without a program that there is not."""
+def _plain_fields(items: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Fields by name, with lists for tuples; `computed` is left out if it is None."""
     given = ((name, value) for name, value in items if not (name == "computed" and value is None))
     return {name: list(value) if isinstance(value, tuple) else value for name, value in given}
 
 
 def readings_from(facts: Any, duration: float | None) -> Readings | None:
-    """Readings from their `facts`, as a file of a proof has them; None for None, a law that is read at every t.
+    """Readings from their `facts`, which files of proofs contain; None for None, a law that is read at every t.
 
     Args:
         duration: as in Readings.
@@ -109,7 +112,7 @@ def readings_from(facts: Any, duration: float | None) -> Readings | None:
 
 
 class Run(NamedTuple):
-    """Closed loops at an age after a reading, (runs, *batch, …) each."""
+    """Closed loops some time after a reading; each field is (runs, *batch, …)."""
 
     t: Time
     x: State
@@ -120,17 +123,19 @@ class Run(NamedTuple):
 
 
 def simulate_runs(loop: ClosedLoop, readings: Readings, t: Time, x: State, share: PerState) -> Run:
-    """Closed loops at t + share · span(t), if the law is read at (t, x) and its control used at once, by Runge-Kutta
-    steps: without errors, and with random ones of their largest size.
+    """Closed loops at t + share · span(t) whose control was read at (t, x) and used at once.
+
+    The first run has no errors; the others have errors of their largest size and random sign. The integration takes
+    SIMULATION_STEPS steps of the classical Runge-Kutta method.
     """
     bounds = [x.new_tensor(each) for each in (readings.errors, readings.control_errors)]
     generator, age, runs = torch.Generator().manual_seed(0), share * readings.span(t), []
-    for k in range(RUNS if any(readings.errors) or any(readings.control_errors) else 1):
+    for k in range(SIMULATED_RUNS if any(readings.errors) or any(readings.control_errors) else 1):
         signs = [2 * torch.randint(2, each.shape, generator=generator).to(x) - 1 for each in bounds]
         e, r = ((bound * sign * (k > 0)).expand(*x.shape[:-1], -1) for bound, sign in zip(bounds, signs, strict=True))
         u, now = readings.control(loop, t, x, e, r), x
-        for _ in range(STEPS):
-            now = _runge_kutta(loop, now, u, age / STEPS)
+        for _ in range(SIMULATION_STEPS):
+            now = _runge_kutta(loop, now, u, age / SIMULATION_STEPS)
         drift = (now - x) / age.clamp_min(1e-9)[..., None] - loop.system.dynamics(x, u)
         runs.append((t + age, now, u, torch.where(age[..., None] > 1e-9, drift, 0.0), e, r))
     return Run(*(torch.stack(each) for each in zip(*runs, strict=True)))

@@ -1,7 +1,7 @@
-"""Rounding in another program's arithmetic, as an operator of graphs: the identity for values, an error for bounds.
+"""Rounding errors of another program, as an operator in graphs that does not change values but widens bounds.
 
-A function that imitates another program marks its results by mark_rounded. Values and derivatives are those of the
-exact function; the bounds of lyapnet.prover.bounds hold for every function whose results have the marked errors.
+A function in real numbers that describes another program marks each rounded result with mark_rounded. Its values and
+derivatives stay those of real numbers; its bounds (lyapnet.prover.bounds) hold for every choice of the marked errors.
 """
 
 from contextlib import AbstractContextManager
@@ -13,18 +13,18 @@ from lyapnet.base.operators import BOUNDS, are_operators, as_operators
 
 
 def rounding(counted: bool) -> AbstractContextManager[None]:
-    """A context in which mark_rounded leaves an operator in traced graphs if `counted`; else it returns y."""
+    """A context in which traced graphs contain the errors of mark_rounded if `counted`; else mark_rounded returns y."""
     return as_operators(BOUNDS, counted)
 
 
 def mark_rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
-    """y; for bounds, any y (1 + θ) + η with |θ| ≤ relative and |η| ≤ absolute; any number if |y| may exceed `largest`.
+    """y, whose bounds enclose y (1 + θ) + η for all |θ| ≤ relative and |η| ≤ absolute.
 
-    θ and η may differ at each point and in each use of the result.
+    They are infinite where |y| may exceed `largest`. θ and η may differ at each point and in each use of the result.
 
     Args:
         y: in float64; it may be constant.
-        at: the point, on which the errors may depend.
+        at: the point (t, x), on which the errors may depend.
     """
     return torch.ops.lyapnet.rounded(y, at, relative, absolute, largest) if are_operators(BOUNDS) else y
 

@@ -1,4 +1,4 @@
-"""Operator graphs rewritten for bounds: the same function, with tighter bounds."""
+"""Rewrites graphs of operators: the function stays the same, and its bounds become tighter."""
 
 import copy
 from operator import attrgetter
@@ -16,7 +16,7 @@ COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view
 
 
 def without_copies(graph: Graph) -> Graph:
-    """The graph without nodes that return their argument, and without repeated computations."""
+    """The graph without nodes that only return their argument, and without repeated computations."""
     constants: dict[Any, Node] = {}
     for node in list(graph.nodes):
         if node.op == "get_attr":  # without_repetitions does not merge constants
@@ -30,35 +30,36 @@ def without_copies(graph: Graph) -> Graph:
 
 
 def with_known_truths(graph: Graph) -> Graph:
-    """The graph with c = 1 inside x and c = 0 inside y for each where(c, x, y) with a scalar c: the same function.
+    """The same function with c = 1 inside x and c = 0 inside y, for each where(c, x, y) with a scalar c.
 
-    Differentiable code guards its branches, as in where(c, p/where(c, d, 1), y). On a box that does not decide c, the
-    inner result would enclose both d and 1, however small the box is.
+    Differentiable code often has such conditions twice, as in where(c, p/where(c, d, 1), y). On a box on which c is
+    neither true nor false throughout, the bounds of the inner where would enclose both d and 1, on small boxes too.
     """
     for node in list(graph.nodes):
         if node.target is aten.where.self and isinstance(node.args[0], Node) and _shape(node.args[0]) == ():
             truth, *branches = node.args
             known = [
-                _assuming(graph, truth, value, y, before=node) for value, y in zip((True, False), branches, strict=True)
+                _copy_with_truth(graph, truth, value, y, before=node)
+                for value, y in zip((True, False), branches, strict=True)
             ]
             node.args = (truth, *known)
     graph.eliminate_dead_code()
     return graph
 
 
-def _assuming(graph: Graph, truth: Node, value: bool, result: Any, before: Node) -> Any:
-    """The result, from copies of the nodes between a truth and it, in which the truth has a known value."""
+def _copy_with_truth(graph: Graph, truth: Node, value: bool, result: Any, before: Node) -> Any:
+    """A copy of the result, with copies of all nodes between the truth and it in which the truth has a known value."""
     copies: dict[Node, Any] = {}
     with graph.inserting_before(before):
-        for node in _between(truth, result):
+        for node in _nodes_between(truth, result):
             if not copies:
                 copies[truth] = graph.call_function(aten.full.default, ([], value), {"dtype": torch.bool})
             copies[node] = graph.node_copy(node, lambda source: copies.get(source, source))
     return copies.get(result, result)
 
 
-def _between(start: Node, end: Any) -> list[Node]:
-    """The nodes that depend on the start and on which the end depends, in the order of the graph."""
+def _nodes_between(start: Node, end: Any) -> list[Node]:
+    """The nodes that depend on the start and on which the end depends, the end included, in the order of the graph."""
     if not isinstance(end, Node):
         return []
     below, above = {start}, {end}
@@ -73,9 +74,9 @@ def _between(start: Node, end: Any) -> list[Node]:
 
 
 def with_limited_arguments(module: GraphModule) -> GraphModule:
-    """The graph with y(min(x, c)) in the place of y(x) in each where(x > c, …, y(x)): the same function.
+    """The same function with y(min(x, c)) instead of y(x) in each where(x > c, …, y(x)), as softplus is written.
 
-    Softplus is written so. Without the limit the bounds of eˣ overflow where the result is x.
+    Without this limit the bounds of eˣ in a softplus overflow for large x, where the result is x.
     """
     graph = copy.deepcopy(module.graph)
     for node in list(graph.nodes):
@@ -85,25 +86,30 @@ def with_limited_arguments(module: GraphModule) -> GraphModule:
             with graph.inserting_before(node):
                 copies: dict[Any, Any] = {x: graph.call_function(aten.clamp.default, (x, None, truth.args[1]))}
                 copies[x].meta = dict(x.meta)
-                for each in _between(x, node.args[2]):
+                for each in _nodes_between(x, node.args[2]):
                     copies[each] = graph.node_copy(each, lambda source, known=copies: known.get(source, source))
             node.args = (*node.args[:2], copies.get(node.args[2], node.args[2]))
     graph.eliminate_dead_code()
     return GraphModule(module, graph)
 
 
-DECIDED = 2.0**-22
-"""Distance from a threshold, relative to the numbers that were added, beyond which float32 comes to the same truth."""
+SAFE_DISTANCE = 2.0**-22
+"""Least distance of t from a threshold at which float32 surely compares them like real numbers do; relative to the sum
+of the sizes of all numbers in the comparison. It is 4 units of float32, 2⁻²⁴ each.
+"""
 
 
 def with_known_times(module: GraphModule, latest: float) -> GraphModule:
-    """The graph for 0 ≤ t ≤ latest, t its first argument: clamps that keep t are gone, and so are choices that its
-    truths about t decide. Programs in float32 or float64 keep t and choose likewise.
+    """The same function for 0 ≤ t ≤ latest, where t is its first argument, without operations that do nothing there.
 
-    Followed are t plus numbers, which rise with t: what holds at both ends of its range holds between them.
+    These are clamps that do not change t, and where(truth, x, y) with a truth about t that is the same for all these t.
+    Only t plus or minus constants is considered, which rises with t, so that what holds at both ends of its range
+    holds between them. Programs in float32 and float64 come to the same truths.
     """
-    graph, ends, truths = copy.deepcopy(module.graph), dict[Node, list[float]](), dict[Node, bool]()
-    sizes = dict[Node, float]()  # of the numbers that were added
+    graph = copy.deepcopy(module.graph)
+    ends = dict[Node, list[float]]()  # values at t = 0 and at t = latest
+    truths = dict[Node, bool]()  # known truths about t
+    sizes = dict[Node, float]()  # Σ |summands|, for the rounding of float32
     for node in list(graph.nodes):
         source, name = next(iter(node.args), None), name_of(node.target)
         if node.op == "placeholder" and not ends:
@@ -116,7 +122,7 @@ def with_known_times(module: GraphModule, latest: float) -> GraphModule:
                 node.replace_all_uses_with(chosen)
         elif source in ends and isinstance(node.args[-1], int | float) and not node.kwargs:
             at = [float(node.target(torch.tensor(end, dtype=torch.float64), *node.args[1:])) for end in ends[source]]
-            room = DECIDED * (sizes[source] + abs(node.args[-1]))
+            room = SAFE_DISTANCE * (sizes[source] + abs(node.args[-1]))
             if name in ("add", "sub"):
                 ends[node], sizes[node] = at, sizes[source] + abs(node.args[-1])
             elif name == "clamp" and at == ends[source] == [0.0, latest] and not 0 < abs(node.args[-1] - latest) < room:
@@ -129,7 +135,7 @@ def with_known_times(module: GraphModule, latest: float) -> GraphModule:
 
 
 def _content(graph: Graph, node: Node) -> Any:
-    """A key that equal constants share: dtype, shape and bits of a tensor; else the name."""
+    """A key that equal constants share: dtype, shape and bits of a tensor; the name of other constants."""
     value = attrgetter(str(node.target))(graph.owning_module) if graph.owning_module is not None else None
     if not isinstance(value, Tensor):
         return str(node.target)
@@ -140,5 +146,5 @@ def _content(graph: Graph, node: Node) -> Any:
 
 
 def _shape(node: Any) -> Any:
-    """The shape of the node's value; if it was not recorded, the node itself, which equals no other."""
+    """The shape of the node's value; if it was not recorded, the node itself, which equals no shape."""
     return node.meta["val"].shape if isinstance(node.meta.get("val"), Tensor) else node

@@ -19,7 +19,7 @@ entry, more than any entry has.
   with A ≤ 2m, not A²/m; ((M·w)·w)·w, not M·w³; ε·(a·b), not (ε·a)·b.
 - Overflow gives an infinity or a nan, in terms or in the remainder; `interval` then returns infinite bounds.
 
-So bounds of numbers below 1e-300 are correct but contain zero, and bounds are wide where derivatives underflow.
+So bounds of numbers below 1e-300 are correct but contain 0, and bounds are wide where derivatives underflow.
 
 Sources: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004, for the first
 degree; Neumaier, "Taylor forms: use and limits", Reliable Computing 2003, for higher ones. The remainder here is one
@@ -102,10 +102,7 @@ class TaylorForm:
         return self.center.abs() + self.spread + self.radius
 
     def interval(self) -> tuple[OnBoxes, OnBoxes]:
-        """(lower, upper) bounds of the set: c minus and plus the reach of the polynomial and r, with room for rounding.
-
-        Both are infinite where one of them is not finite.
-        """
+        """(lower, upper) bounds of the set, with room for rounding; both are infinite where one is not finite."""
         slack = self.radius + 4 * len(self.terms) * EPSILON * self.magnitude + TINY
         lower, upper = self.center - self._reach(-1) - slack, self.center + self._reach(1) + slack
         known = lower.isfinite() & upper.isfinite()
@@ -134,16 +131,16 @@ class TaylorForm:
 
     @property
     def excess(self) -> OnBoxes:
-        """Half the width of the bounds, minus half the width Σ |A| of those of the linear part."""
+        """Half the width of the bounds minus Σ |A|, half the width of the bounds of the linear part."""
         lower, upper = self.interval()
         return (upper - lower) / 2 - _absolute_sum(self.coefficients)
 
     def with_rounding(self, operations: int = 1) -> "TaylorForm":
-        """The form with a larger r: room for this many rounded operations on each entry, in sequence or in one sum."""
+        """The form with a larger r, for the errors of this many rounded operations on each entry, in turn or a sum."""
         return self.with_parts(self.terms, self.radius + (2 * operations * EPSILON) * self.magnitude + TINY)
 
     def with_parts(self, terms: Terms, radius: OnBoxes) -> "TaylorForm":
-        """A form with other terms and another remainder in the same ε."""
+        """A form with other terms and another r, in the same ε."""
         return TaylorForm(terms, radius, self.dimension)
 
     def as_rank(self, rank: int) -> "TaylorForm":
@@ -192,13 +189,13 @@ def box_form(lower: Corners, upper: Corners, degree: int = 1) -> TaylorForm:
 
 
 def wide_axes(lower: Corners, upper: Corners) -> Tensor:
-    """The axes along which some box has a width > 0; axis 0 if all are points, since forms without ε are intervals."""
+    """The axes along which some box has a width > 0; axis 0 if there are none, as a form without ε is an interval."""
     wide = torch.nonzero((upper > lower).any(0)).flatten()
     return wide if len(wide) else torch.zeros(1, dtype=torch.long)
 
 
 def interval_form(lower: Corners, upper: Corners) -> TaylorForm:
-    """The boxes as intervals: no ε, only remainders, so that dependence on the same point is lost."""
+    """The coordinates of points in boxes as intervals, forms without ε, which do not know that they share the point."""
     return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).with_rounding(2)
 
 
@@ -211,7 +208,7 @@ def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
 
 
 def aligned(*forms: TaylorForm) -> list[TaylorForm]:
-    """The forms with the same number of axes each, as broadcasting requires."""
+    """The forms with equal numbers of axes, as broadcasting gives them."""
     rank = max(len(form.shape) for form in forms)
     return [form.as_rank(rank) for form in forms]
 

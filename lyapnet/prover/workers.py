@@ -27,17 +27,17 @@ Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
 
 START_TIMEOUT = 120  # seconds until all workers of a cluster have started
 
-_own: list[Any] = []  # in a worker process: the question that it answers
+_question: list[Any] = []  # in a worker process: its copy of the question, as the only element
 
 
 @contextmanager
-def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]:
-    """A pool of worker processes that have a question; None for one worker, or if processes cannot be forked."""
+def _worker_pool(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]:
+    """A pool of processes with a copy of the question each; None for one worker, or if processes cannot be forked."""
     if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
         yield None
         return
     context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(question,)) as pool:
         try:
             yield pool
         except BrokenProcessPool as error:
@@ -47,13 +47,14 @@ def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]
 
 
 @contextmanager
-def bounding(
+def workers_for_boxes(
     question: Any, workers: int, ray: str | None = None, make_question: Callable[[], Any] | None = None
 ) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
-    """A parallel `map` of question.undecided over chunks of boxes.
+    """A parallel `map` of question.find_undecided over chunks of boxes.
 
-    The workers are copies of this process, made at the beginning. They see the question as it was then, except for its
-    `level`, which is always current. One worker is this process itself, as on systems that cannot fork processes.
+    The workers are copies of this process, made at the beginning. They have the question as it was then, except for its
+    `level`, which is sent with each chunk. A single worker is this process itself; so is it where processes cannot be
+    forked.
 
     Args:
         ray: address of a Ray cluster whose cores bound the boxes, instead of this machine.
@@ -63,16 +64,18 @@ def bounding(
         UsageError: a worker was killed, perhaps for lack of memory, or the cluster does not answer.
     """
     if ray is not None:
-        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as run:
-            yield partial(_undecided_in_parallel, run, question)
+        with connected(ray) as cluster, _cluster_map(cluster, make_question, workers) as run:
+            yield partial(_find_undecided_in_parallel, run, question)
         return
-    with _copies(question, workers) as pool:
-        yield map if pool is None else partial(_undecided_in_parallel, partial(pool.map, _undecided), question)
+    with _worker_pool(question, workers) as pool:
+        yield (
+            map if pool is None else partial(_find_undecided_in_parallel, partial(pool.map, _find_undecided), question)
+        )
 
 
 @contextmanager
-def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
-    """A `map` of _undecided on a cluster; its machines import modules from the same paths as this one."""
+def _cluster_map(cluster: Any, make_question: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
+    """A `map` of _find_undecided on a cluster; its machines import modules from the same paths as this one."""
     cores = int(cluster.cluster_resources().get("CPU", 0))
     if workers > cores:
         raise UsageError(f"Expected at most the {cores} cores of the cluster, got --workers {workers}; ask for fewer.")
@@ -81,10 +84,12 @@ def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Call
     actors = [worker.remote() for _ in range(workers)]
     try:
         cluster.get(
-            [each.begin.remote(make_question, torch.get_default_dtype()) for each in actors], timeout=START_TIMEOUT
+            [each.start.remote(make_question, torch.get_default_dtype()) for each in actors], timeout=START_TIMEOUT
         )
         pool = cluster.util.ActorPool(actors)
-        yield lambda arguments: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), arguments))
+        yield lambda arguments: map(
+            _copy_arrays, pool.map(lambda each, what: each.find_undecided.remote(what), arguments)
+        )
     except cluster.exceptions.GetTimeoutError as error:
         raise UsageError(
             f"Expected {workers} free cores of the cluster within {START_TIMEOUT} s, got fewer; choose fewer --workers."
@@ -100,39 +105,39 @@ def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Call
 class ClusterWorker:
     """A worker on another machine."""
 
-    def begin(self, make_question: Callable[[], Any], default: torch.dtype) -> None:
+    def start(self, make_question: Callable[[], Any], default: torch.dtype) -> None:
         use_threads(1)
         torch.set_default_dtype(default)
-        _own[:] = [make_question()]
+        _question[:] = [make_question()]
 
-    def undecided(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-        return _undecided(_own_copy(arguments))
+    def find_undecided(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return _find_undecided(_copy_arrays(arguments))
 
 
-def _own_copy(data: Any) -> Any:
+def _copy_arrays(data: Any) -> Any:
     """Copy arrays, because those that Ray passes are read-only."""
     return tree_map_only(np.ndarray, np.copy, data)
 
 
 @contextmanager
-def answering(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any, ...]]], Iterable[Any]]]:
-    """A parallel `map` of question.of over tuples of arguments, by local workers as in `bounding`.
+def workers_for_calls(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any, ...]]], Iterable[Any]]]:
+    """A parallel `map` of question.enclose over tuples of arguments, by local workers as in `workers_for_boxes`.
 
     Raises:
         UsageError: a worker was killed, perhaps for lack of memory.
     """
-    with _copies(question, workers) as pool:
+    with _worker_pool(question, workers) as pool:
         if pool is None:
-            yield lambda arguments: (question.of(*each) for each in arguments)
+            yield lambda arguments: (question.enclose(*each) for each in arguments)
         else:
-            yield lambda arguments: map(_as_tensors, pool.map(_answer, map(_as_arrays, arguments)))
+            yield lambda arguments: map(_as_tensors, pool.map(_enclose, map(_as_arrays, arguments)))
 
 
-def _answer(arguments: Any) -> Any:
-    """In a worker: question.of, from arrays to arrays."""
-    (question,) = _own
+def _enclose(arguments: Any) -> Any:
+    """In a worker: question.enclose, from arrays to arrays."""
+    (question,) = _question
     with torch.no_grad():
-        return _as_arrays(question.of(*_as_tensors(arguments)))
+        return _as_arrays(question.enclose(*_as_tensors(arguments)))
 
 
 def _as_arrays(data: Any) -> Any:
@@ -143,22 +148,22 @@ def _as_tensors(data: Any) -> Any:
     return tree_map_only(np.ndarray, torch.from_numpy, data)
 
 
-def _undecided_in_parallel(
+def _find_undecided_in_parallel(
     run: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
 ) -> Iterator[tuple[Boxes, Tensor]]:
-    """question.undecided of each chunk, by `run`, a map of _undecided over tuples of the level and arrays of boxes."""
+    """question.find_undecided of each chunk; `run` maps _find_undecided over tuples (level, arrays of the boxes)."""
     arguments = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
     for *parts, axis in run(arguments):
         yield Boxes(*map(torch.from_numpy, parts)), torch.from_numpy(axis)
 
 
-def _begin(question: Any) -> None:
-    """Become a worker: one thread; leave signals to the parent process, and end with it."""
+def _start_worker(question: Any) -> None:
+    """In a worker: use one thread, leave Ctrl-C to the parent process, and end with it."""
     use_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    _own[:] = [question]
+    _question[:] = [question]
 
 
 def _end_with_parent() -> None:
@@ -168,9 +173,9 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _undecided(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-    """In a worker: question.undecided, from arrays to arrays."""
-    (question,), (level, *parts) = _own, arguments
+def _find_undecided(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """In a worker: question.find_undecided, from arrays to arrays."""
+    (question,), (level, *parts) = _question, arguments
     question.level = level
-    boxes, axis = question.undecided(Boxes(*map(torch.from_numpy, parts)))
+    boxes, axis = question.find_undecided(Boxes(*map(torch.from_numpy, parts)))
     return (*(part.numpy() for part in boxes), axis.numpy())

@@ -56,7 +56,7 @@ def refine(
         run = _finished_run(folder)
         if run is None:
             certificate = certified(checkpoint)
-            if certificate.complete:
+            if certificate.is_complete:
                 return checkpoint, certificate
             if not (folder / CONFIG).exists():
                 _prepare(folder, certificate, overrides, parts)
@@ -68,7 +68,7 @@ def refine(
 def failing_points(certificate: Refinable) -> Tensor:
     """Points (t, x) of the claimed set at which a condition fails or is undecided, (k, 1 + n)."""
     claim, generator = certificate.claim, stream(certificate.controller.config.seed, CERTIFICATION, 1)
-    failing = violations(*certificate.sought(), POINTS_PER_ROUND, generator)
+    failing = violations(*certificate.searched_condition(), POINTS_PER_ROUND, generator)
     chosen = torch.randperm(len(claim.undecided), generator=generator)[:POINTS_PER_ROUND]
     return torch.cat([failing, claim.undecided[chosen]])
 

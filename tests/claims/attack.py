@@ -14,7 +14,7 @@ import torch
 
 import lyapnet
 from lyapnet.base.contracts import copied
-from lyapnet.claims.arguments import under_noise
+from lyapnet.claims.arguments import with_noise
 from lyapnet.claims.checking import check
 from lyapnet.prover.kept_proofs import read_proofs
 
@@ -54,7 +54,7 @@ def attack_funnel(controller, claim, of, paths, finer, generator):
 
 def attack_reach(controller, claim, of, paths, finer, generator):
     """(name, observed, its standard error, bound) of a target reached under noise."""
-    loop, problem = under_noise(of["noise"], controller)
+    loop, problem = with_noise(of["noise"], controller)
     loop, V = copied(loop), copied(loop).V
     dt, now, corner = controller.horizon.dt / finer, torch.zeros(()), _worst_corner(problem, V)
     target, risk, rho = torch.tensor(of["target"]), claim["risk"], claim["rho"]

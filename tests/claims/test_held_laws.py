@@ -364,6 +364,6 @@ def test_where_the_level_set_is_empty_nothing_is_claimed(V):
 def test_what_failed_after_a_reading_goes_into_training():
     certificate = claimed(budget=4000, interval=0.8)
     assert certificate.verdict == "falsified"
-    points = violations(*certificate.sought(), 100, torch.Generator().manual_seed(0))
+    points = violations(*certificate.searched_condition(), 100, torch.Generator().manual_seed(0))
     assert points.shape[-1] == 2
     assert len(points)

@@ -22,7 +22,7 @@ from lyapnet.cli import main
 from lyapnet.cli.options import read_intervals
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
-from lyapnet.prover.boxes import pieces
+from lyapnet.prover.boxes import divide_box
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import Box
@@ -271,14 +271,14 @@ def test_the_jacobian_is_bounded_for_each_plant_and_the_metric_that_of_V():
 
 def test_pieces_cover_a_box():
     lower, upper = torch.tensor([0.0, -1.0, 0.3, 2.0]), torch.tensor([0.0, 1.0, 0.7, 2.0])
-    low, high = pieces(lower, upper, [2, 3], 7)
+    low, high = divide_box(lower, upper, [2, 3], 7)
     assert len(low) == 7
     assert low[0].equal(lower)
     assert high[-1].equal(upper)
     assert low[1:, 2].equal(high[:-1, 2])
-    low, high = pieces(lower, upper, [1, 2], 16)
+    low, high = divide_box(lower, upper, [1, 2], 16)
     assert float((high - low)[:, 1:3].prod(-1).sum()) == pytest.approx(0.8)
-    assert [len(side) for side in pieces(lower, upper, [])] == [1, 1]
+    assert [len(side) for side in divide_box(lower, upper, [])] == [1, 1]
 
 
 # Words and files
@@ -299,7 +299,7 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     assert certificate.result["nominal_parameters"] == {"gain": 1.0}
     assert certificate.result["set"] == [[-1.0], [1.0]]
     assert "--parameter=gain=2:3" in certificate.command("run.ckpt")
-    condition, (lower, upper), _ = certificate.sought()
+    condition, (lower, upper), _ = certificate.searched_condition()
     assert (lower.tolist(), upper.tolist()) == ([0.0, -1.0, 2.0], [0.0, 1.0, 3.0])
     assert float(condition(torch.zeros(()), torch.tensor([0.9, 2.5])).detach()) < 0
     assert certificate.figure().axes

@@ -16,7 +16,7 @@ from scipy.integrate import quad
 import lyapnet
 from lyapnet.base.errors import UsageError
 from lyapnet.claims import reach_decrease
-from lyapnet.claims.arguments import under_noise
+from lyapnet.claims.arguments import with_noise
 from lyapnet.claims.checking import check
 from lyapnet.claims.reach import prove_reach
 from lyapnet.cli.options import read_pushes
@@ -337,7 +337,7 @@ def test_a_controller_is_certified_from_python():
 
 
 def test_the_noise_of_the_claim_is_not_rounded():
-    loop, _ = under_noise({"x2": 0.3}, noiseless())
+    loop, _ = with_noise({"x2": 0.3}, noiseless())
     assert float(loop.noise.sigma[1, 0]) == 0.3
 
 

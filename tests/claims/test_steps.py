@@ -216,7 +216,7 @@ def test_the_first_sentence_says_that_it_is_about_steps():
     assert "and F(x) ∈ D" in formulas[0]
     assert certificate.result["steps"] == "0.1 s, euler"
     json.dumps(certificate.result, allow_nan=False)
-    assert certificate.complete
+    assert certificate.is_complete
 
 
 @pytest.mark.gate

@@ -13,7 +13,7 @@ from lyapnet.claims.certify import certify
 from lyapnet.claims.kinds import Tube
 from lyapnet.claims.tubes import enclosure
 from lyapnet.claims.tubes.certificate import TubeCertificate
-from lyapnet.claims.tubes.coordinates import Moving, ratio_of, rotated, turning
+from lyapnet.claims.tubes.coordinates import Moving, bound_in_new_frame, bound_turn, ratio_of_errors
 from lyapnet.claims.tubes.tube import prove_tube
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
@@ -173,12 +173,12 @@ def test_coordinates_without_an_inverse_bound_nothing_and_leave_the_other_cells_
     """A narrow spike in f gives such coordinates: its slope stretches them by e⁵⁰ along the middle of a cell."""
     good = torch.tensor([[2.0, 1.0], [0.0, 1.0]]).double()
     frames, r = torch.stack([good, torch.tensor(bad).double(), good]), torch.full((3, 2), 0.1).double()
-    found = rotated(frames, frames.abs(), frames, frames.abs(), 0 * r, r)
-    alone = rotated(*([frames[:1], frames[:1].abs()] * 2), 0 * r[:1], r[:1])
+    found = bound_in_new_frame(frames, frames.abs(), frames, frames.abs(), 0 * r, r)
+    alone = bound_in_new_frame(*([frames[:1], frames[:1].abs()] * 2), 0 * r[:1], r[:1])
     assert found[[0, 2]].tolist() == [alone[0].tolist()] * 2
     assert not bool(found[1].isfinite().all())
-    E = turning(Moving(frames, 0 * frames, 0 * frames))[1]
-    assert ratio_of(E).isfinite().flatten().tolist() == [True, False, True]
+    E = bound_turn(Moving(frames, 0 * frames, 0 * frames))[1]
+    assert ratio_of_errors(E).isfinite().flatten().tolist() == [True, False, True]
 
 
 class Pretending(Escaping):
@@ -224,13 +224,13 @@ def test_simulations_are_not_believed(monkeypatch):
 def test_without_the_bounds_they_would_be(monkeypatch):
     """The counterpart: if the defect of the polynomials is set to 0, the claim is false."""
     monkeypatch.setattr(enclosure.nominal, "integrate", bad_nominal)
-    bounded = enclosure._Tube._bounded
+    bounded = enclosure._Tube._bound_defect
 
     def careless(self, *arguments):
         w, cost, *others = bounded(self, *arguments)
         return 0 * w, cost, *others
 
-    monkeypatch.setattr(enclosure._Tube, "_bounded", careless)
+    monkeypatch.setattr(enclosure._Tube, "_bound_defect", careless)
     about = controller(Swinging(), Formula(damped))
     assert outside(prove_tube(about, Budget(20)), about)[0] > 0
 

@@ -20,7 +20,7 @@ from lyapnet.prover import (
     simplification,
     taylor,
 )
-from lyapnet.prover.boxes import CutTree, single
+from lyapnet.prover.boxes import CutTree, root_box
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.prover.counterexamples import violations
@@ -322,7 +322,7 @@ def test_a_check_believes_neither_lists_nor_levels(change, P, kept):
 def test_a_check_refuses_an_unfinished_proof_at_once(P, kept, monkeypatch):
     waiting = len(read(kept)["frontier"])
     assert waiting > 0
-    monkeypatch.setattr("lyapnet.prover.proof.WhereItHolds.undecided", None)
+    monkeypatch.setattr("lyapnet.prover.proof.ProvedLevel.find_undecided", None)
     with pytest.raises(
         UsageError, match=f"got an unfinished one .undecided boxes: {waiting}.; go on with .*--keep .*proof.pt"
     ):
@@ -342,7 +342,7 @@ def test_a_check_refuses_other_cuts_and_another_v(P, finished):
 
 def test_leaves_cover_their_box_exactly():
     generator, tree, (lower, upper) = torch.Generator().manual_seed(0), CutTree(), domain()
-    boxes = single(lower, upper)
+    boxes = root_box(lower, upper)
     for _ in range(6):
         boxes = tree.cut(boxes, torch.randint(3, (len(boxes.key),), generator=generator))
         boxes = boxes[torch.rand(len(boxes.key), generator=generator) < 0.8]

@@ -150,8 +150,8 @@ def test_machine_code_leaves_others_to_the_interpreter():
 @pytest.mark.parametrize("name", ["absolute, limits", "power 1.5, no limits", "entropy, limits", "norm, ball", "ball"])
 def test_bounds_that_are_too_narrow_are_found(name, monkeypatch):
     """The twin: without the doubt about slopes."""
-    slopes, kind = minima._slopes, "full" if name in ("absolute, limits", "ball") else "multiple of the identity"
-    monkeypatch.setattr(minima, "_slopes", lambda program: (slopes(program)[0], 0 * slopes(program)[1]))
+    slopes, kind = minima._bound_slopes, "full" if name in ("absolute, limits", "ball") else "multiple of the identity"
+    monkeypatch.setattr(minima, "_bound_slopes", lambda program: (slopes(program)[0], 0 * slopes(program)[1]))
     assert examine(*pairs(2)[name], 2, kind, 2, 200, 20)[1] > 0
 
 

@@ -12,11 +12,11 @@ import lyapnet
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.least_cost import RiseCondition
 from lyapnet.prover import proof
-from lyapnet.prover.boxes import Boxes, single
+from lyapnet.prover.boxes import Boxes, root_box
 from lyapnet.prover.branch_and_bound import Budget, Question
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
-from lyapnet.prover.proof import WhereItHolds, bounded_again, prove, proved_by
-from lyapnet.prover.workers import bounding
+from lyapnet.prover.proof import ProvedLevel, identify_bounds, prove, remake_question
+from lyapnet.prover.workers import workers_for_boxes
 from tests.claims.planted import domain, loop, riccati
 from tests.claims.test_least_cost import problem
 
@@ -34,20 +34,20 @@ class InHalves(Question):
 
 
 def chunks():
-    box = single(torch.zeros(2), torch.ones(2))
+    box = root_box(torch.zeros(2), torch.ones(2))
     return [box, box.joined(box), Boxes(*(part[:0] for part in box))]
 
 
 def test_workers_are_other_processes_that_see_the_level_as_it_is():
     question = InHalves()
-    with bounding(question, 2) as run:
+    with workers_for_boxes(question, 2) as run:
         (one, axes), (two, _), (none, _) = run(question.undecided, chunks())
         assert [len(boxes.key) for boxes in (one, two, none)] == [1, 2, 0]
         assert axes.tolist() == [0]
         assert float(one.key) != os.getpid()
         question.level = 2.0
         assert [len(boxes.key) for boxes, _ in run(question.undecided, chunks())] == [0, 0, 0]
-    with bounding(question, 1) as run:
+    with workers_for_boxes(question, 1) as run:
         assert run is map
 
 
@@ -71,7 +71,7 @@ def test_a_worker_that_is_killed_is_one_line():
     question, before = Killed(), threading.active_count()
     with (
         pytest.raises(UsageError, match="Expected all workers to finish, got one that was killed"),
-        bounding(question, 2) as run,
+        workers_for_boxes(question, 2) as run,
     ):
         list(run(question.undecided, chunks()))
     assert threading.active_count() <= before + 2, "the threads of a pool ended with it"
@@ -83,9 +83,9 @@ def test_another_machine_bounds_the_same_or_nothing():
     pickle = pytest.importorskip("cloudpickle")
     condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
     bounded = bounded_condition(condition, domain(), 1, torch.inf)
-    question = WhereItHolds(condition, bounded, torch.inf, True)
-    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, torch.inf, proved_by(bounded))
-    boxes, rounds = single(*domain()), 0
+    question = ProvedLevel(condition, bounded, torch.inf, True)
+    there = remake_question(pickle.loads(pickle.dumps(condition)), domain(), 1, torch.inf, identify_bounds(bounded))
+    boxes, rounds = root_box(*domain()), 0
     while len(boxes.key):
         rounds += 1
         (here, axis), (other, same) = question.undecided(boxes), there.undecided(boxes)
@@ -93,10 +93,10 @@ def test_another_machine_bounds_the_same_or_nothing():
         assert torch.equal(axis, same)
         boxes = here.halves(axis) if len(axis) else here
     assert rounds > 3
-    function, sources, torchs = proved_by(bounded)
+    function, sources, torchs = identify_bounds(bounded)
     for other in (("0" * 64, sources, torchs), (function, "0" * 64, torchs), (function, sources, "1.0")):
         with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
-            bounded_again(condition, domain(), 1, torch.inf, other)
+            remake_question(condition, domain(), 1, torch.inf, other)
 
 
 @pytest.mark.gate
@@ -118,7 +118,7 @@ def test_what_a_cluster_cannot_do_is_one_line(monkeypatch):
     try:
         with pytest.raises(UsageError, match="cores of the cluster, got --workers 5000; ask for fewer"):
             prove(condition, domain(), 1.0, Budget(60, workers=5000, ray="local"))
-        monkeypatch.setattr(proof, "proved_by", lambda bounded: ("other", "code", "here"))
+        monkeypatch.setattr(proof, "identify_bounds", lambda bounded: ("other", "code", "here"))
         with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
             prove(condition, domain(), 1.0, Budget(60, ray="local"))
         assert signal.getsignal(signal.SIGTERM) is handler

@@ -155,7 +155,7 @@ def test_what_is_pushed_is_refined_against_the_push(run):
     pushed = SoundCertificate(
         still.controller, dataclasses.replace(still.claim, disturbance=torch.tensor([0.0, 0.5]).double()), {"seed": 0}
     )
-    (condition, domain, level), (other, *_) = pushed.sought(), still.sought()
+    (condition, domain, level), (other, *_) = pushed.searched_condition(), still.searched_condition()
     assert level == still.claim.wanted
     t, x = torch.zeros(50).double(), domain[0][1:] + (domain[1] - domain[0])[1:] * torch.rand(50, 2).double()
     _, slope = still.controller.V.value_and_state_gradient(t, x)
@@ -206,8 +206,8 @@ def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
         ProvedRegion, decay=0.01, states=Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1,
         contraction=None, slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
     )  # fmt: skip
-    assert RegionCertificate(controller, claim(rho=1.9999), {"seed": 0}).complete
-    assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).complete
+    assert RegionCertificate(controller, claim(rho=1.9999), {"seed": 0}).is_complete
+    assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).is_complete
 
 
 @pytest.mark.gate

@@ -31,7 +31,9 @@ class Moving(NamedTuple):
         return Moving(*(part[chosen] for part in tuple(self)))
 
 
-def rotated(before: Tensor, size: Tensor, after: Tensor, size_after: Tensor, jump: Tensor, r: State) -> State:
+def bound_in_new_frame(
+    before: Tensor, size: Tensor, after: Tensor, size_after: Tensor, jump: Tensor, r: State
+) -> State:
     """A bound of |z'| where Az + j = Bz', |z| ≤ r and |j| ≤ jump, (cells, n).
 
     With Y ≈ B⁻¹, |Y(Az + j)| ≤ v = |YA|r + |Y| jump. Since B⁻¹ = (YB)⁻¹Y, |z'| ≤ v + ν/(1 − ν) max v, where ν is the
@@ -44,10 +46,10 @@ def rotated(before: Tensor, size: Tensor, after: Tensor, size_after: Tensor, jum
     Y, n = near_inverse(after), r.shape[-1]
     into = (Y @ before).abs() + 4 * (n + 4) * EPSILON * (Y.abs() @ size)
     v = ((into @ r[..., None] + Y.abs() @ jump[..., None])[..., 0]) * ROOM
-    return (v + ratio_of(_inverse_error(Y, after, size_after)) * v.amax(-1, keepdim=True)) * ROOM
+    return (v + ratio_of_errors(_inverse_error(Y, after, size_after)) * v.amax(-1, keepdim=True)) * ROOM
 
 
-def turning(frame: Moving) -> tuple[Tensor, Tensor]:
+def bound_turn(frame: Moving) -> tuple[Tensor, Tensor]:
     """(Y, E), (cells, n, n) each: Y ≈ Φ(0)⁻¹ in the middle of a step, and |YΦ(τ) − 1| ≤ E at every τ."""
     Y = near_inverse(frame.middle)
     n = Y.shape[-1]
@@ -63,7 +65,7 @@ def near_inverse(A: Tensor) -> Tensor:
     return torch.linalg.inv_ex(A).inverse
 
 
-def ratio_of(E: Tensor) -> Tensor:
+def ratio_of_errors(E: Tensor) -> Tensor:
     """ν/(1 − ν) for the largest row sum ν of E, (cells, 1); ∞ if ν ≥ 1."""
     nu = E.sum(-1).amax(-1, keepdim=True) * ROOM
     return torch.where(nu < 1, nu / (1 - nu) * ROOM, torch.inf)

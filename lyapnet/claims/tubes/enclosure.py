@@ -7,18 +7,18 @@ from torch import Tensor
 
 from lyapnet.base.types import Corners, PerBox, State, Terms
 from lyapnet.claims.tubes import nominal
-from lyapnet.claims.tubes.coordinates import ROOM, Moving, near_inverse, ratio_of, rotated, turning
+from lyapnet.claims.tubes.coordinates import ROOM, Moving, bound_in_new_frame, bound_turn, near_inverse, ratio_of_errors
 from lyapnet.claims.tubes.field import DEGREE, Field
-from lyapnet.claims.tubes.nominal import at_end, derivative, flow, over_step, places
+from lyapnet.claims.tubes.nominal import at_step_end, derivative, flow, interpolate_step, places
 from lyapnet.prover.taylor import EPSILON, TaylorForm, monomials
 
-LEAST = 1e-30  # the smallest r̂, for states that do not move
+SMALLEST_RADIUS = 1e-30  # the smallest r̂, for states that do not move
 TRIES = 6  # values of r̂ to test on a step
-SKEW = 100.0  # coordinates with a larger condition number are made orthogonal
-TURN = 0.3  # largest change of the coordinates within a step, relative to them
-LEAK = 1e-3  # a growth of r of this size over T is accepted without shortening steps
-SHORTEST = 1 / 2000  # shortest step, as a share of T
-WIDEST = 0.5  # a cell is given up when r is larger, in units of the states
+LARGEST_CONDITION = 100.0  # coordinates with a larger condition number are made orthogonal
+LARGEST_TURN = 0.3  # largest change of the coordinates within a step, relative to them
+HARMLESS_GROWTH = 1e-3  # a growth of r of this size over T is accepted without shortening steps
+SHORTEST_STEP = 1 / 2000  # shortest step, as a share of T
+LARGEST_RADIUS = 0.5  # a cell is given up when r is larger, in units of the states
 BINS = 60  # equal parts of [0, T] for which ranges are stored
 
 
@@ -53,7 +53,7 @@ class Step(NamedTuple):
     rest: PerBox  # the largest remainder of the Taylor forms of Yv
     cost: Tensor  # bounds of the integral of ℓ minus its polynomial, (cells, 2)
     worst: Tensor  # bounds of max_j h_j over the step, (cells, 2); −∞ without constraints
-    bend: Tensor  # as _Tube._bends
+    bend: Tensor  # as _Tube._bend_sizes
     held: Tensor  # bool: whether the step is proved
 
 
@@ -68,7 +68,7 @@ class Front(NamedTuple):
     radius: State  # |z| ≤ r in these coordinates
     cost: Tensor  # bounds of ∫ℓ minus its polynomial, (cells, 2)
 
-    def of(self, chosen: Tensor) -> "Front":
+    def select(self, chosen: Tensor) -> "Front":
         """The front of some of the cells."""
         frame = None if self.frame is None else self.frame[chosen]
         parts = nominal.Flow(self.flow.y[:, chosen], self.flow.rate[:, chosen])
@@ -105,7 +105,7 @@ class Enclosure:
         self.n = field.n
         self.kinks = [*field.kinks(duration, dt), duration]
 
-    def of(self, cells: Cells, axes: list[int]) -> Enclosed:
+    def enclose(self, cells: Cells, axes: list[int]) -> Enclosed:
         """Enclose the closed loops of some cells.
 
         Args:
@@ -115,7 +115,7 @@ class Enclosure:
         h = self.duration / 100
         while tube.front.t < self.duration and bool(tube.alive.any()):
             h = tube.step(h)
-        return tube.enclosed()
+        return tube.results()
 
 
 class _Tube:
@@ -155,28 +155,31 @@ class _Tube:
         """
         enclosure, front = self.enclosure, self.front
         kink = next(t for t in enclosure.kinks if t > front.t + 1e-7 * enclosure.duration)
-        shortest = SHORTEST * enclosure.duration
+        shortest = SHORTEST_STEP * enclosure.duration
         while True:
             end = front.t + h if front.t + 1.25 * h < kink else kink
             y = nominal.integrate(enclosure.field.slope, front.t, end - front.t, front.y)
             after = flow(enclosure.field.slope, end, y, self.e)
-            p = over_step(front.flow, after, end - front.t, self.e)
+            p = interpolate_step(front.flow, after, end - front.t, self.e)
             frame, turn = self._frame(front, p, end)
             turned = float(turn.quantile(0.9, interpolation="lower"))
-            if turned < TURN or h <= shortest:
-                result = self._attempt(self._at_start(front, p, frame), p, frame, front.t, end)
-                fast = result.rest > LEAK / enclosure.duration
+            if turned < LARGEST_TURN or h <= shortest:
+                result = self._bound_step(self._radius_at_start(front, p, frame), p, frame, front.t, end)
+                fast = result.rest > HARMLESS_GROWTH / enclosure.duration
                 ratio = torch.where(
-                    fast | ~result.held, result.bend[:, 0] / result.bend[:, 1:].sum(-1).clamp_min(LEAST), 0.0
+                    fast | ~result.held, result.bend[:, 0] / result.bend[:, 1:].sum(-1).clamp_min(SMALLEST_RADIUS), 0.0
                 )
                 share = float(ratio.nan_to_num(0.0).quantile(0.9, interpolation="lower"))
                 if share <= 1 or h <= shortest:
                     break
             h = max(h / 2, shortest)
         self._accept(
-            Front(end, y, after, at_end(p, self.e, 1), frame, result.radius, front.cost + result.cost), frame, p, result
+            Front(end, y, after, at_step_end(p, self.e, 1), frame, result.radius, front.cost + result.cost),
+            frame,
+            p,
+            result,
         )
-        return min(1.5 * h, enclosure.duration / 50) if share < 0.1 and turned < TURN / 2 else h
+        return min(1.5 * h, enclosure.duration / 50) if share < 0.1 and turned < LARGEST_TURN / 2 else h
 
     def _accept(self, front: Front, frame: Moving, p: Terms, result: Step) -> None:
         """Store the results of a step, and keep the cells for which it is proved."""
@@ -185,17 +188,17 @@ class _Tube:
         self.bend[living] = torch.maximum(self.bend[living], result.bend[:, 1:-1].nan_to_num(0.0))
         self.violated[living] |= result.held & (low > 0)
         self.kept[living] &= high <= 0
-        within = ((result.radius @ torch.ones(self.n, dtype=torch.float64)) <= WIDEST) & ~self.violated[living]
+        within = ((result.radius @ torch.ones(self.n, dtype=torch.float64)) <= LARGEST_RADIUS) & ~self.violated[living]
         held = result.held & within & result.radius.isfinite().all(-1)
         self.steps += 1
-        reach = self._range(p, frame, result.radius)
+        reach = self._bound_states(p, frame, result.radius)
         first = int(self.front.t / enclosure.duration * BINS * (1 - 1e-9))
         last = min(BINS - 1, int(front.t / enclosure.duration * BINS))
         for k in range(first, last + 1):
             self.ranges[k, living, :, 0] = torch.minimum(self.ranges[k, living, :, 0], reach[..., 0])
             self.ranges[k, living, :, 1] = torch.maximum(self.ranges[k, living, :, 1], reach[..., 1])
         self.alive[living] = held
-        self.front = front.of(held)
+        self.front = front.select(held)
 
     def _frame(self, front: Front, p: Terms, end: float) -> tuple[Moving, Tensor]:
         """Choose coordinates for a step; return them and the size of their change, in floating point.
@@ -210,12 +213,12 @@ class _Tube:
             A = front.frame.at(1) / unit[:, None]
             A = A / A.norm(dim=1, keepdim=True)
             # a matrix that is not finite has no singular values; its cell is not proved for any choice here
-            skewed = torch.linalg.cond(A.where(A.isfinite(), 0.0)) > SKEW
-            A_r = front.frame.at(1) / unit[:, None] * front.radius[:, None, :].clamp_min(LEAST)
+            skewed = torch.linalg.cond(A.where(A.isfinite(), 0.0)) > LARGEST_CONDITION
+            A_r = front.frame.at(1) / unit[:, None] * front.radius[:, None, :].clamp_min(SMALLEST_RADIUS)
             longest = A_r.norm(dim=1).argsort(-1, descending=True)[:, None].expand_as(A)
             orthogonal = torch.linalg.qr(torch.gather(A_r, 2, longest))[0]
             Q = unit[:, None] * torch.where(skewed[:, None, None], orthogonal, A)
-        begins, ends = (at_end(p, self.e, tau)[0, :, : self.n] for tau in (-1, 1))
+        begins, ends = (at_step_end(p, self.e, tau)[0, :, : self.n] for tau in (-1, 1))
         J = self._jacobians([front.t, (front.t + end) / 2, end], [begins, p[0, :, : self.n], ends])
         A = torch.linalg.matrix_exp(h * J[1]) @ Q
         bend = h / 8 * (J[2] @ A - J[0] @ Q)
@@ -231,25 +234,25 @@ class _Tube:
         plus, minus = self.enclosure.field.slope(t, points)[..., : self.n]
         return ((plus - minus) / (2 * step.diagonal()[:, None, None, None])).movedim(0, -1)
 
-    def _at_start(self, front: Front, p: Terms, frame: Moving) -> tuple[Tensor, Tensor]:
+    def _radius_at_start(self, front: Front, p: Terms, frame: Moving) -> tuple[Tensor, Tensor]:
         """(r, the error of ∫ℓ) at the beginning of a step, in its coordinates; both include the rounding of p."""
-        begins = at_end(p, self.e, -1)
-        size = at_end(p.abs(), self.e, 1) + front.end.abs()
+        begins = at_step_end(p, self.e, -1)
+        size = at_step_end(p.abs(), self.e, 1) + front.end.abs()
         jump = ((begins - front.end).abs() + 16 * EPSILON * size).sum(0) * ROOM
         before = frame.at(-1) if front.frame is None else front.frame.at(1)
         size = frame.size if front.frame is None else front.frame.size
         r, jump, error = front.radius, jump[:, : self.n], jump[:, self.n]
         if front.frame is None:  # the radius is still a bound of x itself
             r, jump = torch.zeros_like(r), jump + r
-        return rotated(before, size, frame.at(-1), frame.size, jump, r), error
+        return bound_in_new_frame(before, size, frame.at(-1), frame.size, jump, r), error
 
-    def _attempt(self, start: tuple[Tensor, Tensor], p: Terms, frame: Moving, t: float, end: float) -> Step:
+    def _bound_step(self, start: tuple[Tensor, Tensor], p: Terms, frame: Moving, t: float, end: float) -> Step:
         """Bound a step, with increasing r̂ until it is proved or TRIES are used up."""
         r, error = start
         h, count = end - t, len(r)
-        Y, E = turning(frame)
-        tail = ratio_of(E)
-        hat = 1.1 * r + h * LEAK / self.enclosure.duration + LEAST
+        Y, E = bound_turn(frame)
+        tail = ratio_of_errors(E)
+        hat = 1.1 * r + h * HARMLESS_GROWTH / self.enclosure.duration + SMALLEST_RADIUS
         result = Step(
             r.clone(), torch.zeros_like(r[:, 0]), torch.zeros(count, 2, dtype=r.dtype),
             torch.full((count, 2), -torch.inf, dtype=r.dtype), torch.zeros(count, 2 + self.e, dtype=r.dtype),
@@ -257,7 +260,7 @@ class _Tube:
         )  # fmt: skip
         todo = torch.arange(count)
         for _ in range(TRIES):
-            w, cost, worst, defect = self._bounded(p[:, todo], frame[todo], Y[todo], hat[todo], t, end)
+            w, cost, worst, defect = self._bound_defect(p[:, todo], frame[todo], Y[todo], hat[todo], t, end)
             Ew = (E[todo] @ w[..., None])[..., 0] * ROOM
             rate = (w + Ew + tail[todo] * Ew.amax(-1, keepdim=True)) * ROOM
             needed = (r[todo] + h * rate) * ROOM
@@ -266,7 +269,7 @@ class _Tube:
             cost = h * cost + slack
             cost = cost + cost.abs() * torch.tensor([-1e-12, 1e-12], dtype=r.dtype)
             for part, value in zip(
-                result, (needed, defect.radius.amax(-1), cost, worst, self._bends(defect), held), strict=True
+                result, (needed, defect.radius.amax(-1), cost, worst, self._bend_sizes(defect), held), strict=True
             ):
                 part[todo] = value
             hat[todo] = torch.where(held[:, None], hat[todo], 1.2 * torch.maximum(needed, hat[todo]))
@@ -275,13 +278,13 @@ class _Tube:
                 break
         return result
 
-    def _bounded(
+    def _bound_defect(
         self, p: Terms, frame: Moving, Y: Tensor, hat: State, t: float, end: float
     ) -> tuple[Tensor, Tensor, Tensor, TaylorForm]:
         """(a bound of |Yv|, bounds of ℓ − its polynomial, bounds of max_j h_j, Yv) on a step, if |z| ≤ r̂."""
         n, h, cells = self.n, end - t, p.shape[1]
         self.bounded += cells
-        x, rate = self._moving(p, frame, hat)
+        x, rate = self._moving_polynomials(p, frame, hat)
         rate = rate * (2 / h)
         constants = torch.zeros(len(x), cells, 1 + n * n, dtype=x.dtype)
         constants[0] = torch.cat([torch.full((cells, 1), (t + end) / 2, dtype=x.dtype), Y.flatten(1)], -1)
@@ -296,7 +299,7 @@ class _Tube:
         worst = [side.amax(-1) for side in h_form[0].interval()] if h_form else [low.new_full((cells,), -torch.inf)] * 2
         return torch.maximum(low.abs(), high.abs()), torch.stack(cost.interval(), -1), torch.stack(worst, -1), defect
 
-    def _moving(self, p: Terms, frame: Moving, hat: State) -> tuple[Tensor, Tensor]:
+    def _moving_polynomials(self, p: Terms, frame: Moving, hat: State) -> tuple[Tensor, Tensor]:
         """p + Φz, and ∂/∂τ of (p + Φz, the polynomial of ∫ℓ), as polynomials in (τ, ε, z/r̂)."""
         x, rate = self._padded(p[..., : self.n]), self._padded(derivative(p, self.e))
         for j in range(self.n):
@@ -308,7 +311,7 @@ class _Tube:
             rate[self.place[0, z], :, : self.n] += 2 * bend
         return x, rate
 
-    def _bends(self, form: TaylorForm) -> Tensor:
+    def _bend_sizes(self, form: TaylorForm) -> Tensor:
         """The size of the terms of degree three due to τ, each ε_k, and z, (cells, 2 + e), as a measure of bending."""
         bends = torch.zeros(form.radius.shape[0], 2 + self.e, dtype=torch.float64)
         for axes, k in self.place.items():
@@ -332,25 +335,25 @@ class _Tube:
         found[[self.place[axes] for axes in places(1 + self.e, DEGREE)]] = terms
         return found
 
-    def _range(self, p: Terms, frame: Moving, r: State) -> Tensor:
+    def _bound_states(self, p: Terms, frame: Moving, r: State) -> Tensor:
         """Bounds of x over a step, (cells, n, 2)."""
         p = p[..., : self.n]
         reach = (p[1:].abs().sum(0) + (frame.size @ r[..., None])[..., 0]) * ROOM + 16 * EPSILON * p[0].abs()
         return torch.stack([p[0] - reach, p[0] + reach], -1)
 
-    def enclosed(self) -> Enclosed:
+    def results(self) -> Enclosed:
         """The results after the last step."""
         front, n, count = self.front, self.n, len(self.alive)
         living = torch.nonzero(self.alive).flatten()
         terms = torch.zeros(len(places(self.e, DEGREE)), count, dtype=torch.float64)
         slack, ends = torch.zeros(count, 2, dtype=torch.float64), torch.zeros(count, n, 2, dtype=torch.float64)
         if len(living):
-            terms[:, living], slack[living], ends[living] = self._at_end_of_horizon(front)
+            terms[:, living], slack[living], ends[living] = self._bound_end(front)
         return Enclosed(
             self.alive & self.kept, self.violated, terms, slack, ends, self.ranges, self.bend, self.steps, self.bounded
         )
 
-    def _at_end_of_horizon(self, front: Front) -> tuple[Tensor, Tensor, Tensor]:
+    def _bound_end(self, front: Front) -> tuple[Tensor, Tensor, Tensor]:
         """(a polynomial in ε near J, bounds of J minus it, bounds of x(T))."""
         n, alone = self.n, list(places(self.e, DEGREE))
         assert front.frame is not None

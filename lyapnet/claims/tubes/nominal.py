@@ -54,7 +54,7 @@ def integrate(slope: Slope, t: float, h: float, y: Tensor) -> Tensor:
     return y
 
 
-def over_step(before: Flow, after: Flow, h: float, e: int) -> Tensor:
+def interpolate_step(before: Flow, after: Flow, h: float, e: int) -> Tensor:
     """p(τ, ε) over h seconds, τ from −1 to 1, through what it is at both ends; (terms, cells, n + 1).
 
     Coefficients of ε⁰, ε¹ and ε² are polynomials in τ of degree 3, 2 and 1, so that p is continuous from step to step,
@@ -81,7 +81,7 @@ def derivative(terms: Terms, e: int) -> Tensor:
     return found
 
 
-def at_end(terms: Terms, e: int, tau: int) -> Tensor:
+def at_step_end(terms: Terms, e: int, tau: int) -> Tensor:
     """p(τ, ε) at τ = ±1, with terms in the order of `monomials(e, DEGREE)`; each is a sum of at most four."""
     place = places(e, DEGREE)
     found = terms.new_zeros(len(place), *terms.shape[1:])

@@ -17,11 +17,11 @@ from lyapnet.claims.tubes.enclosure import BINS, Cells, Enclosed, Enclosure
 from lyapnet.claims.tubes.field import DEGREE, Field
 from lyapnet.claims.tubes.nominal import places
 from lyapnet.controller.controller import Controller
-from lyapnet.prover.boxes import Boxes, roots
+from lyapnet.prover.boxes import Boxes, root_boxes
 from lyapnet.prover.branch_and_bound import Budget
-from lyapnet.prover.proof import Progress, tell
-from lyapnet.prover.verdict import Verdict, time_spent
-from lyapnet.prover.workers import answering
+from lyapnet.prover.proof import Progress, report_stage
+from lyapnet.prover.verdict import Verdict, time_limit_reason
+from lyapnet.prover.workers import workers_for_calls
 from lyapnet.task.constraints import names_of
 from lyapnet.task.sets import Box
 
@@ -79,7 +79,7 @@ class ProvedTube:
         if self.verdict != "unknown":
             return None
         if self.volume_share < 1:
-            return f"{time_spent(self.set_up)}: allow more"
+            return f"{time_limit_reason(self.set_up)}: allow more"
         return "the bound of ‖x(T) − goal‖ is larger than the radius: allow more seconds, or a larger radius"
 
     @property
@@ -120,7 +120,7 @@ class ProvedTube:
         return (self.cells.upper - self.cells.lower)[:, list(self.axes)].prod(-1)
 
 
-class _Results:
+class _TubeResults:
     """The results of all cells so far."""
 
     def __init__(self, n: int):
@@ -159,25 +159,25 @@ def prove_tube(
     """
     budget = budget or Budget()
     problem, loop = controller.problem, copied(controller.closed_loop)
-    tell(report, budget, "calling and tracing f, g, the cost and u")
+    report_stage(report, budget, "calling and tracing f, g, the cost and u")
     left_out = ignorable_states(loop, problem.constraints)
     seen = [i for i in range(problem.system.n) if i not in left_out]
     X0 = slice_at_zero(problem.initial_states, left_out)
     lower, upper = X0.lower[seen], X0.upper[seen]
     axes = [i for i in range(len(seen)) if upper[i] > lower[i]]
     enclosure = _enclosure_of(controller, loop, seen)
-    found, waiting = _Results(len(seen)), _cut_up(roots(lower[None], upper[None], 0.0), axes, CELLS)
-    with torch.no_grad(), signals_taken(budget.stop.ask), answering(enclosure, budget.workers) as answers:
+    found, waiting = _TubeResults(len(seen)), _halve_repeatedly(root_boxes(lower[None], upper[None], 0.0), axes, CELLS)
+    with torch.no_grad(), signals_taken(budget.stop.ask), workers_for_calls(enclosure, budget.workers) as answers:
         budget.stop.searching, set_up = True, budget.elapsed
         while len(waiting.key) and not budget.spent(found.boxes) and found.violating is None:
-            some, waiting = _choose(waiting, waiting.volumes(lower, upper), AT_ONCE * budget.workers)
+            some, waiting = _choose_cells(waiting, waiting.volumes(lower, upper), AT_ONCE * budget.workers)
             chunks = [Cells(chunk.lower, chunk.upper) for chunk in some.split(AT_ONCE)]
             results = list(answers([(cells, axes) for cells in chunks]))
             for boxes, cells, enclosed in zip(some.split(AT_ONCE), chunks, results, strict=True):
                 found.add(cells, enclosed, boxes.volumes(lower, upper))
                 to_cut = ~enclosed.proved & ~enclosed.violated & (boxes.volumes(lower, upper) > SMALLEST)
                 if axes and bool(to_cut.any()):
-                    cut_axes = _axis_to_cut(boxes[to_cut], enclosed.bend[to_cut], axes, lower, upper)
+                    cut_axes = _choose_axes(boxes[to_cut], enclosed.bend[to_cut], axes, lower, upper)
                     waiting = waiting.joined(boxes[to_cut].halves(cut_axes))
             if report is not None:
                 report(Progress(found.boxes, max(0.0, 1 - found.share), budget.elapsed))
@@ -199,7 +199,7 @@ def _enclosure_of(controller: Controller, loop: Any, seen: list[int]) -> Enclosu
     return Enclosure(field, problem.horizon.duration, problem.horizon.dt, unit[seen])
 
 
-def _choose(waiting: Boxes, sizes: Tensor, count: int) -> tuple[Boxes, Boxes]:
+def _choose_cells(waiting: Boxes, sizes: Tensor, count: int) -> tuple[Boxes, Boxes]:
     """(the next cells, the others). Half of the next cells are the smallest, which are likely to be proved; half are
     the largest, so that cells that cannot be proved do not take all of the time.
     """
@@ -214,7 +214,7 @@ def _seeded() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-def _cut_up(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
+def _halve_repeatedly(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
     """Halve boxes along each of their axes in turn, up to at most `count` boxes."""
     turn = 0
     while axes and 2 * len(boxes.key) <= count:
@@ -223,7 +223,7 @@ def _cut_up(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
     return boxes
 
 
-def _axis_to_cut(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: State) -> Tensor:
+def _choose_axes(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: State) -> Tensor:
     """The axis along which to cut each box: the one of the largest bend among those that are not too narrow."""
     widths = ((boxes.upper - boxes.lower) / (upper - lower).where(upper > lower, 1.0))[:, list(axes)]
     score = torch.where(widths >= widths.amax(-1, keepdim=True) / 64, bend + 1e-12 * widths, -1.0)
@@ -231,7 +231,7 @@ def _axis_to_cut(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, 
 
 
 def _claim_of(
-    controller: Controller, enclosure: Enclosure, X0: Box, seen: list[int], axes: list[int], found: _Results,
+    controller: Controller, enclosure: Enclosure, X0: Box, seen: list[int], axes: list[int], found: _TubeResults,
     budget: Budget, radius: float | None, set_up: float,
 ) -> ProvedTube:  # fmt: skip
     n, terms = len(seen), len(places(len(axes), DEGREE))

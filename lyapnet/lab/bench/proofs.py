@@ -7,7 +7,7 @@ import torch
 
 from lyapnet.lab.bench.conditions import Bounded, condition_of_chain
 from lyapnet.lab.bench.enclosures import ENCLOSURES, Enclosure, enclosure
-from lyapnet.prover.boxes import single
+from lyapnet.prover.boxes import root_box
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.proof import prove
 
@@ -61,7 +61,7 @@ def bisect(case: Bounded, enclose: Enclosure, budget: Budget) -> tuple[str, int]
     Nothing of what the certifier adds: no search beyond the middles of boxes, no choice of axis by remainder.
     """
     sides = torch.where(case.upper > case.lower, case.upper - case.lower, 1.0)
-    frontier = single(case.lower, case.upper, 0.0)
+    frontier = root_box(case.lower, case.upper, 0.0)
     boxes = 0
     while len(frontier.key):
         if budget.spent(boxes):

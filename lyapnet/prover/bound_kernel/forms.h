@@ -48,7 +48,7 @@ struct Block {  // data that all operations on a block of boxes use
     }
     V magnitude(const Entry &x) const { return absolute(x.terms[0]) + spread(x) + x.radius(); }
 
-    // The end of an operation: the sizes of its result, and room in r for this many rounded operations.
+    // Ends an operation: computes the sizes of its result, and adds the errors of this many rounded operations to r.
     void finish(const Entry &x, double operations) const {
         for (int k = 1, i = 1; k <= degree; k++) {
             V total = splat(0);
@@ -208,7 +208,7 @@ void expanded(const Powers &powers, const Argument &of, const Jet &jet, const Ra
     out.terms[0] += a;
 }
 
-// The end of a function: r is infinite where no bound of the argument is known, or f is not smooth on its interval.
+// Ends the application of a function: r is infinite where the argument has no bound or f is not smooth on its interval.
 void settle(const Block &block, const Entry &out, M known, double operations) {
     for (int i = 0; i < out.support->count; i++) out.terms[i] = known ? out.terms[i] : splat(0);
     block.finish(out, operations);

@@ -322,7 +322,7 @@ struct WithinBall {
     M defined(V, V) const { return always(); }
 };
 
-// its slope
+// The derivative of WithinBall
 struct SlopeWithinBall {
     static constexpr bool SMOOTH = false;
     Jet jet(V v) const {

@@ -20,11 +20,11 @@ from lyapnet.prover.bound_kernel.writing import write_graph
 from lyapnet.prover.taylor import TaylorForm
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("functions.h", "forms.h", "program.cpp"))
-MOST_AXES = 16  # equal to that in forms.h
+MOST_AXES = 16  # the same constant as in forms.h
 
 
 class BoundKernel:
-    """Machine code for the results of a graph, for boxes with a width along the same axes or forms of equal supports.
+    """Machine code for the results of a graph, on boxes with the same wide axes or on forms with the same supports.
 
     Args:
         nodes, constants: the nodes of the graph, and the values of those that do not depend on the point.
@@ -51,7 +51,7 @@ class BoundKernel:
         return self._run(len(lower), lower.contiguous(), upper.contiguous())
 
     def image(self, given: TaylorForm) -> list[TaylorForm]:
-        """The results if the inputs are in a form, (boxes, inputs); its terms outside the supports must be 0."""
+        """The results for all inputs in a form of shape (inputs,); its terms outside the supports must be 0."""
         parts = torch.cat([given.terms.movedim(0, -1), given.radius[..., None]], -1)
         return self._run(len(parts), parts.contiguous(), None)
 
@@ -76,7 +76,7 @@ class BoundKernel:
 def kernel_of(
     nodes: Sequence[Any], constants: dict[Any, Any], inputs: Sequence[Support], dimension: int, degree: int
 ) -> BoundKernel | None:
-    """A kernel; None if an operation has no rule for machine code, or the C++ code cannot be compiled."""
+    """The kernel, or None if an operation has no rule for machine code or the C++ code cannot be compiled."""
     try:
         return BoundKernel(nodes, constants, inputs, dimension, degree) if has_library() else None
     except NotImplementedError:

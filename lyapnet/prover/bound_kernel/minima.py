@@ -1,4 +1,4 @@
-"""The rule of lyapnet.prover.minima for machine code, which has closed forms alone; the interpreter has the others."""
+"""The rule of lyapnet.prover.minima for machine code: closed forms only; other minima are left to the interpreter."""
 
 from typing import Any
 

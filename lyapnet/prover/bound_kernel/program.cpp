@@ -54,7 +54,7 @@ void tiles(const V *const *x, const double *w, int inner, int columns, V *const 
     if (terms - t == 3) tile<J, 3>(x, w, inner, columns, out, t);
 }
 
-// taylor.matrix_product for one row; entries with a smaller support than that of the result are padded
+// taylor.matrix_product for one row; entries with a smaller support than the result are padded with zeros
 void matrix_product(const Block &block, const int *&code) {
     const int inner = *code++, columns = *code++;
     const double *weights = block.numbers + *code++;

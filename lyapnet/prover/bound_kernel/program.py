@@ -25,22 +25,15 @@ FUNCTIONS = {
         "leaky", "clamp", "within_ball", "slope_within_ball",
     ))
 }  # fmt: skip
-LINEAR = {
-    "tan",
-    "square",
-    "absolute",
-    "leaky",
-    "clamp",
-    "within_ball",
-    "slope_within_ball",
-}  # functions that are bounded by a line for any degree
+ALWAYS_LINEAR = {"tan", "square", "absolute", "leaky", "clamp", "within_ball", "slope_within_ball"}
+"""Functions whose result is linear in their argument for forms of any degree."""
 
-Support = tuple[int, ...]  # increasing numbers of the monomials that a form can have, 0 (the constant) included
+Support = tuple[int, ...]  # increasing indices in `monomials` of the terms that may be nonzero; 0, the constant, is one
 CONSTANT: Support = (0,)
 
 
-def of_boxes(axes: int, wide: Sequence[int]) -> list[Support]:
-    """The supports of the coordinates of a box; each coordinate along a wide axis has an ε of its own."""
+def supports_of_boxes(axes: int, wide: Sequence[int]) -> list[Support]:
+    """The support of each coordinate of a box; those along wide axes have an ε of their own."""
     return [(0, 1 + wide.index(k)) if k in wide else CONSTANT for k in range(axes)]
 
 
@@ -48,7 +41,7 @@ class Entry(int):
     """The form of one number, given by its index in the list of forms of a program."""
 
 
-ZERO = Entry(0)  # the number 0, so that an arrangement that pads with the index 0 pads with zero
+ZERO = Entry(0)  # the form of the number 0: operators that pad entries with 0 thus pad with zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +66,8 @@ class Assembled(NamedTuple):
     tables: np.ndarray
     code: np.ndarray
     numbers: np.ndarray
-    arena: int  # memory for the forms of one box, in numbers
-    spare: int  # memory for intermediate results of one operation, in numbers
+    arena: int  # memory for the forms of one box, in float64 numbers
+    spare: int  # memory for intermediate results of one operation, in float64 numbers
 
 
 class Program:
@@ -89,13 +82,15 @@ class Program:
         self.degree, self.dimension = degree, dimension
         self.monomials = monomials(self.dimension, degree)
         number = {powers: k for k, powers in enumerate(self.monomials)}
-        self._place = [[number.get(tuple(sorted(a + b)), -1) for b in self.monomials] for a in self.monomials]
-        self._powers: dict[tuple[Support, Support], Support] = {}
+        self._monomial_product = [
+            [number.get(tuple(sorted(a + b)), -1) for b in self.monomials] for a in self.monomials
+        ]
+        self._product_supports: dict[tuple[Support, Support], Support] = {}
         self._products: dict[tuple[Support, Support, Support], int] = {}
         self._placings: dict[tuple[Support, Support], int] = {}
-        self._known: dict[tuple[object, ...], Entry] = {}
+        self._written: dict[tuple[object, ...], Entry] = {}
         self._numbers: list[float] = []
-        self._number: dict[float | bytes, int] = {}
+        self._indices: dict[float | bytes, int] = {}
         self._instructions: list[list[int]] = []
         self._functions: dict[Entry, list[int]] = {}
         self._spare = 3 * (len(self.monomials) + 4)
@@ -107,16 +102,16 @@ class Program:
     def constant(self, value: float) -> Entry:
         """The form of a constant."""
         key = ("constant", value)
-        if key not in self._known:
-            self._known[key] = self._new(CONSTANT)
-            self.constants[self._known[key]] = value
-        return self._known[key]
+        if key not in self._written:
+            self._written[key] = self._new(CONSTANT)
+            self.constants[self._written[key]] = value
+        return self._written[key]
 
     def combine(self, summands: Iterable[tuple[float, Entry]], offset: float = 0.0, operations: int = 1) -> Entry:
         """Σ w x + offset.
 
         Args:
-            operations: number of rounded operations for each number of the result.
+            operations: number of rounded operations for each term of the result; 0 if it is exact.
         """
         summands = [(weight, x) for weight, x in summands if x != ZERO]
         if not summands:
@@ -124,8 +119,12 @@ class Program:
         if summands[0][0] == 1 and len(summands) == 1 and not offset:
             return summands[0][1]
         support = self._union(x for _, x in summands)
-        words = [word for weight, x in summands for word in (x, self._placing(x, support), self._at(weight))]
-        return self._emit("combine", support, operations, len(summands), self._at(offset), *words, result_first=True)
+        words = [
+            word for weight, x in summands for word in (x, self._placing_table(x, support), self._number_index(weight))
+        ]
+        return self._emit(
+            "combine", support, operations, len(summands), self._number_index(offset), *words, result_first=True
+        )
 
     def scale(self, x: Entry, factor: float) -> Entry:
         """factor · x."""
@@ -138,8 +137,8 @@ class Program:
             return self.scale(x, self.constants[y])
         x, y = min(x, y), max(x, y)
         a, b = self.supports[x], self.supports[y]
-        support = self._product(a, b)
-        return self._emit("multiply", support, x, y, behind=(self._table(a, b, support),))
+        support = self._product_support(a, b)
+        return self._emit("multiply", support, x, y, behind=(self._product_table(a, b, support),))
 
     def square(self, x: Entry) -> Entry:
         """x²."""
@@ -148,57 +147,65 @@ class Program:
     def function(self, name: str, x: Entry, p: float = 0.0, q: float = 0.0) -> Entry:
         """f(x) with parameters p and q."""
         support = power = self.supports[x]
-        if name not in LINEAR:
+        if name not in ALWAYS_LINEAR:
             for _ in range(self.degree - 1):
-                power = self._product(power, self.supports[x])
+                power = self._product_support(power, self.supports[x])
                 support = tuple(sorted({*support, *power}))
         a = self.supports[x]
-        powers = self._table(a, a, support), self._table(support, a, support), self._placing(x, support)
-        parameters = self._at(p), self._at(q)
+        powers = (
+            self._product_table(a, a, support),
+            self._product_table(support, a, support),
+            self._placing_table(x, support),
+        )
+        parameters = self._number_index(p), self._number_index(q)
         key = (name, x, *parameters)
-        if key not in self._known:
-            self._known[key] = self._new(support)
-            if x not in self._functions:  # functions of one form share its range, and some also its powers
+        if key not in self._written:
+            self._written[key] = self._new(support)
+            if x not in self._functions:  # functions of one form are one operation: they share its bounds and powers
                 self._functions[x] = [OPERATIONS["functions"], x, 0]
                 self._instructions.append(self._functions[x])
             self._functions[x][2] += 1
-            self._functions[x] += [FUNCTIONS[name], self._known[key], *parameters, *powers]
-        return self._known[key]
+            self._functions[x] += [FUNCTIONS[name], self._written[key], *parameters, *powers]
+        return self._written[key]
 
     def matrix_product(self, row: Sequence[Entry], weight: Tensor) -> list[Entry]:
         """A row times a constant matrix."""
         if not any(row):
             return [ZERO] * weight.shape[1]
-        at, support = self._matrix(weight), self._union(row)
+        at, support = self._matrix_index(weight), self._union(row)
         key = ("matrix_product", at, *row)
-        if key not in self._known:
+        if key not in self._written:
             results = [self._new(support) for _ in range(weight.shape[1])]
-            self._known[key] = results[0]
+            self._written[key] = results[0]
             head = [OPERATIONS["matrix_product"], *weight.shape, at, len(support)]
-            padded = [word for x in row for word in (x, self._placing(x, support))]
+            padded = [word for x in row for word in (x, self._placing_table(x, support))]
             self._instructions.append([*head, *padded, *results])
             self._spare = max(self._spare, len(row) * (len(support) + 1))
-        return [Entry(self._known[key] + j) for j in range(weight.shape[1])]
+        return [Entry(self._written[key] + j) for j in range(weight.shape[1])]
 
     def where(self, truth: Entry, x: Entry, y: Entry) -> Entry:
-        """x where the truth is not 0, else y; a form that encloses both where that is undecided."""
+        """x where the truth is not 0, else y; on undecided boxes a form that encloses both."""
         support = self._union((x, y))
-        return self._emit("where", support, x, y, truth, behind=(self._placing(x, support), self._placing(y, support)))
+        return self._emit(
+            "where", support, x, y, truth, behind=(self._placing_table(x, support), self._placing_table(y, support))
+        )
 
     def truth(self, name: str, *operands: Entry) -> Entry:
-        """A truth value or a sign."""
+        """The truth value or sign that the operation `name` makes of the operands."""
         return self._emit(name, CONSTANT, *operands)
 
     def within_limits(self, x: Entry, low: float, high: float) -> Entry:
         """x, replaced by [low, high] on boxes where its bounds are wider."""
-        return self._emit("within_limits", self.supports[x], x, behind=(self._at(low), self._at(high)))
+        return self._emit(
+            "within_limits", self.supports[x], x, behind=(self._number_index(low), self._number_index(high))
+        )
 
     def rounded(self, x: Entry, *limits: float) -> Entry:
-        """x, rounded in another arithmetic; limits are the relative and the absolute error and the largest number."""
-        return self._emit("rounded", self.supports[x], x, behind=tuple(self._at(limit) for limit in limits))
+        """x, rounded in another arithmetic; limits are its relative and absolute error and its largest number."""
+        return self._emit("rounded", self.supports[x], x, behind=tuple(self._number_index(limit) for limit in limits))
 
     def assembled(self, results: Sequence[Entry]) -> Assembled:
-        """The program with its results; the memory of a form is used again after its last use."""
+        """The program with its results; the memory of a form is reused after the last operation that reads it."""
         offset, arena = self._layout(results)
         of_support = {support: k for k, support in enumerate(dict.fromkeys(self.supports))}
 
@@ -210,7 +217,10 @@ class Program:
                 else:
                     yield word
 
-        code = [len(self.constants), *(word for x, value in self.constants.items() for word in (x, self._at(value)))]
+        code = [
+            len(self.constants),
+            *(word for x, value in self.constants.items() for word in (x, self._number_index(value))),
+        ]
         code += [len(self.inputs), *self.inputs, len(self._instructions)]
         code += [word for instruction in self._instructions for word in instruction]
         code += [len(results), *results]
@@ -219,7 +229,7 @@ class Program:
         return Assembled(tables, np.array(list(words(code)), dtype=np.int32), numbers, arena, self._spare)
 
     def _layout(self, results: Sequence[Entry]) -> tuple[dict[int, int], int]:
-        """(offset of each form, total size); a form takes the place of one of equal size that is no longer used."""
+        """(offset of each form in memory, total size); a form may take the memory of one that is no longer used."""
         kept = {*self.constants, *results}
         last = {word: k for k, line in enumerate(self._instructions) for word in line if isinstance(word, Entry)}
         offset: dict[int, int] = {}
@@ -278,13 +288,13 @@ class Program:
     def _emit(
         self, name: str, support: Support, *words: int, behind: tuple[int, ...] = (), result_first: bool = False
     ) -> Entry:
-        """Write an operation, unless it is written already; its result."""
+        """Write an operation, unless it is written already; its result. `behind` are words after the result."""
         key = (name, *words, *behind)
-        if key not in self._known:
-            self._known[key] = result = self._new(support)
+        if key not in self._written:
+            self._written[key] = result = self._new(support)
             line = [result, *words] if result_first else [*words, result, *behind]
             self._instructions.append([OPERATIONS[name], *line])
-        return self._known[key]
+        return self._written[key]
 
     def _new(self, support: Support) -> Entry:
         self.supports.append(support)
@@ -293,17 +303,17 @@ class Program:
     def _union(self, entries: Iterable[Entry]) -> Support:
         return tuple(sorted({*CONSTANT, *(k for x in entries for k in self.supports[x])}))
 
-    def _product(self, a: Support, b: Support) -> Support:
+    def _product_support(self, a: Support, b: Support) -> Support:
         """The support of the product of two forms with these supports."""
-        if (a, b) not in self._powers:
-            self._powers[a, b] = tuple(sorted({self._place[i][j] for i in a for j in b} - {-1}))
-        return self._powers[a, b]
+        if (a, b) not in self._product_supports:
+            self._product_supports[a, b] = tuple(sorted({self._monomial_product[i][j] for i in a for j in b} - {-1}))
+        return self._product_supports[a, b]
 
-    def _table(self, a: Support, b: Support, support: Support) -> int:
+    def _product_table(self, a: Support, b: Support, support: Support) -> int:
         """The number of the table for products of forms with supports a and b in a third support."""
         return self._products.setdefault((a, b, support), len(self._products))
 
-    def _placing(self, x: Entry, support: Support) -> int:
+    def _placing_table(self, x: Entry, support: Support) -> int:
         """The number of the table that gives the position of each term of x in a larger support."""
         return self._placings.setdefault((self.supports[x], support), len(self._placings))
 
@@ -312,19 +322,19 @@ class Program:
         factors: dict[int, list[tuple[int, int]]] = {monomial: [] for monomial in support}
         for i, m in enumerate(a):
             for j, n in enumerate(b):
-                factors.get(self._place[m][n], []).append((i, j))
+                factors.get(self._monomial_product[m][n], []).append((i, j))
         return list(factors.values())
 
-    def _at(self, number: float) -> int:
-        """The index of a number in the list of constants."""
-        if number not in self._number:
-            self._number[number] = len(self._numbers)
+    def _number_index(self, number: float) -> int:
+        """The index of a number in the list of numbers."""
+        if number not in self._indices:
+            self._indices[number] = len(self._numbers)
             self._numbers.append(number)
-        return self._number[number]
+        return self._indices[number]
 
-    def _matrix(self, weight: Tensor) -> int:
+    def _matrix_index(self, weight: Tensor) -> int:
         content = repr(tuple(weight.shape)).encode() + weight.contiguous().numpy().tobytes()
-        if content not in self._number:
-            self._number[content] = len(self._numbers)
+        if content not in self._indices:
+            self._indices[content] = len(self._numbers)
             self._numbers += weight.flatten().tolist()
-        return self._number[content]
+        return self._indices[content]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.prover.bound_kernel.program import Entry, Forms, Program
-from lyapnet.prover.composed_rules import COMPOSED, in_programs
+from lyapnet.prover.composed_rules import COMPOSED, for_programs
 from lyapnet.prover.rounding import ROUNDED
 from lyapnet.prover.taylor import TINY
 
@@ -167,7 +167,7 @@ def function_of(name: str, *parameters: float) -> Callable[[Program, Forms], For
     return lambda program, x: each(lambda a: program.function(name, a, *parameters), x)
 
 
-NO_THRESHOLD = (math.inf, 0.0)  # torch never replaces the function by another one; see _threshold
+NO_THRESHOLD = (math.inf, 0.0)  # parameters of functions that torch computes by one formula; see _threshold_parameters
 reciprocal = rule(aten.reciprocal.default)(function_of("reciprocal"))
 sigmoid = rule(aten.sigmoid.default)(function_of("sigmoid", *NO_THRESHOLD))
 for _name in ("exp", "log", "log1p", "sqrt", "sin", "cos", "tan"):
@@ -180,22 +180,22 @@ def _tanh(program: Program, x: Forms) -> Forms:
     return each(lambda s: program.combine([(2, s)], -1.0), sigmoid(program, double))
 
 
-def _threshold(threshold: float) -> tuple[float, float]:
-    """(the argument above which torch replaces softplus by the identity, the largest error of that)."""
+def _threshold_parameters(threshold: float) -> tuple[float, float]:
+    """(the argument above which torch replaces softplus by the identity, the largest error of doing so)."""
     return threshold, 1.001 * math.exp(-threshold) + TINY
 
 
 @rule(aten.softplus.default)
 def _softplus(program: Program, x: Forms, beta: float = 1, threshold: float = 20) -> Forms:
     y = x if beta == 1 else multiply(program, x, beta)
-    softplus = function_of("softplus", *_threshold(threshold))(program, y)
+    softplus = function_of("softplus", *_threshold_parameters(threshold))(program, y)
     return softplus if beta == 1 else _divide(program, softplus, beta)
 
 
 @rule(aten.softplus_backward.default)
 def _softplus_backward(program: Program, gradient: Any, x: Forms, beta: float, threshold: float) -> Forms:
     y = x if beta == 1 else multiply(program, x, beta)
-    return multiply(program, gradient, function_of("sigmoid", *_threshold(threshold))(program, y))
+    return multiply(program, gradient, function_of("sigmoid", *_threshold_parameters(threshold))(program, y))
 
 
 # Additions to entries
@@ -212,7 +212,7 @@ def _index_put(program: Program, x: Any, indices: list[Any], values: Any, accumu
 
 
 def _add_at(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor], Tensor]) -> Forms:
-    """x with a source added to entries that are all different."""
+    """x with a source added to some of its entries, at most one number to each."""
     x, source = as_forms(program, x), as_forms(program, source)
     nothing = torch.zeros_like(x.entries)
     if bool((put(nothing, torch.ones_like(source.entries)) > 1).any()):
@@ -220,4 +220,4 @@ def _add_at(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor
     return add(program, x, Forms(put(nothing, source.entries)))
 
 
-RULES.update({operation: in_programs(composed, RULES) for operation, composed in COMPOSED.items()})
+RULES.update({operation: for_programs(composed, RULES) for operation, composed in COMPOSED.items()})

@@ -1,6 +1,6 @@
-"""Translates graphs into programs of bounds, node by node.
+"""Translates a graph into a program of bounds, node by node.
 
-A graph with an operator that has no rule here is bounded by the interpreter of lyapnet.prover.bounds.
+Graphs with an operator that has no rule here are bounded by the interpreter of lyapnet.prover.bounds.
 """
 
 import operator
@@ -22,7 +22,7 @@ RULES = {**rules.RULES, **branch_rules.RULES, **minima.RULES}
 
 
 def write_graph(program: Program, nodes: Sequence[Any], constants: dict[Any, Any]) -> list[Forms]:
-    """Write the operations of a graph into a program; the results of the graph.
+    """Write the operations of a graph into a program; returns the results of the graph.
 
     Raises:
         NotImplementedError: an operation has no rule, or its rule does not cover the arguments.
@@ -54,7 +54,7 @@ def _result(program: Program, node: Any, values: dict[Any, Any], arguments: Any,
 
 
 def _arrange(program: Program, target: Any, *arguments: Any, **keywords: Any) -> Any:
-    """Apply an operator that arranges entries to the numbers of forms; constants become forms first."""
+    """Apply an operator that arranges entries to the indices of forms; constants become forms first."""
     if target is operator.getitem:
         return target(*arguments)
     if target in (aten.cat.default, aten.stack.default):

@@ -1,4 +1,4 @@
-"""Checks a kept proof: anyone can do so with its file and the checkpoint, without trusting the search that made it."""
+"""Checks a kept proof with its file and the checkpoint, without trusting the search that made it."""
 
 import copy
 import math
@@ -39,7 +39,7 @@ from lyapnet.prover.proof import Progress
 from lyapnet.prover.readings import Readings, readings_from
 from lyapnet.task.sets import Box
 
-UNLIMITED = 1e9  # seconds: a check ends when all leaves are bounded, so that it needs no budget
+UNLIMITED = 1e9  # seconds; a check ends when all leaves are bounded, and needs no other limit
 NOT_PROVED = "a leaf is not proved"
 Report = Callable[[Progress], None] | None
 
@@ -49,15 +49,15 @@ def check(
 ) -> dict[str, Any]:
     """Check whether a file proves its claim; return the object that `lyapnet certify check --json` prints.
 
-    The parameters of the claim (α, δ, D, w; λ, B, Y, c; λ, a, the probability; G, σ, ε) are read from the file, and the
-    condition is built from the controller. Everything else is computed again: the levels on X₀ and on the boundary of
-    D, the bounds of the condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The
-    verdict is certified or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is
-    certified up to the ρ of the file, and the result has the share of X₀ in it.
+    The parameters of the claim (such as α, δ and D of a funnel; λ, B, Y and c of a region) are read from the file, and
+    the condition is built from the controller. Everything else is computed again: the levels on X₀ and on the boundary
+    of D, the bounds of the condition and of W on every leaf of the cuts, contraction on B, shares, volumes, κ and e.
+    The verdict is certified or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A
+    region is certified up to the ρ of the file, and the result has the share of X₀ in it.
 
     Args:
-        law: the program that computes u, where the claim is about one; its errors are bounded again, and a claim that
-            its file states has to be this one.
+        law: the program that computes u, if the claim is about one; its errors are bounded again, and if its file
+            states a claim, that must be this one.
     """
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
@@ -96,7 +96,7 @@ class Checked(NamedTuple):
 
     numbers: dict[str, Any]
     reason: str | None  # why it is refused; None if it is certified
-    seconds: float  # to bound the leaves
+    seconds: float  # time to bound the leaves
     searched: float  # seconds of the original search, as recorded in the file
 
 
@@ -105,10 +105,10 @@ Reprove = Callable[..., Checked]
 
 
 def kind_of(path: Path) -> tuple[str, Reprove]:
-    """(the kind of claim that the proofs in a file make, how it is made again).
+    """(the kind of claim that the proofs in a file establish, the function that proves it again).
 
     Raises:
-        UsageError: there is no such file, or it is another.
+        UsageError: there is no such file, or it holds no proofs.
     """
     proofs = read_proofs(path)
     with refuse_bad_file(path):
@@ -123,10 +123,10 @@ class KeptSide(NamedTuple):
     states: Box  # D; of width 0 along ignorable states
     disturbance: State | None
     readings: Readings | None
-    steps: bool  # whether it is about the steps of the model
+    steps: bool  # whether the claim is about the steps of the model
     degree: int  # of the Taylor forms
     rho: float
-    seconds: float  # of the original search
+    seconds: float  # duration of the original search
 
 
 def kept_funnel(controller: Controller, path: Path) -> KeptSide:
@@ -140,7 +140,7 @@ def kept_funnel(controller: Controller, path: Path) -> KeptSide:
 
 
 def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
-    """As kept_funnel, for the proof of that name."""
+    """As kept_funnel, for the proof of this name."""
     content = select_proof(read_proofs(path), name, path)
     with refuse_bad_file(path):
         of = content["of"][0]
@@ -187,7 +187,7 @@ def _reprove_funnel(
 
 
 def _stated(certificate: SoundCertificate) -> dict[str, Any]:
-    """What is proved again, with the claim in words and formulas."""
+    """The numbers that are proved again, with the claim in words and formulas."""
     claim = {"words": certificate.in_words(), "formula": certificate.in_formulas()}
     return {**certificate.proved(), "claim": claim}
 

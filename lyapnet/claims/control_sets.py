@@ -17,7 +17,7 @@ from lyapnet.base.types import Corner
 from lyapnet.graphs.tracing import name_of, trace
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
-from lyapnet.prover.boxes import Boxes, root_boxes
+from lyapnet.prover.boxes import Boxes, random_points, root_boxes
 from lyapnet.prover.branch_and_bound import Budget, Question, choose_axis, run_search
 from lyapnet.prover.minima import BACKWARD, is_minimum
 from lyapnet.prover.taylor import interval_form
@@ -56,7 +56,7 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     if not isinstance(policy, ValuePolicy) or not policy.controls.limited or not reaches_own_code(policy.controls):
         return ""
     name, (lower, upper) = type(policy.controls).__name__, domain
-    points = _random_points(domain, POINTS)
+    points = random_points(*domain, POINTS, torch.Generator().manual_seed(2))
     with torch.no_grad():
         u = policy(points[:, 0], points[:, 1:])
         room = ROUNDING * float(u.abs().max())
@@ -171,7 +171,7 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     Raises:
         UsageError: at a point u is farther from the minimiser than bounds allow for.
     """
-    policy, points = loop.policy, _random_points(domain, MINIMA)
+    policy, points = loop.policy, random_points(*domain, MINIMA, torch.Generator().manual_seed(2))
     if not isinstance(policy, ValuePolicy):
         return ""
     with torch.no_grad():
@@ -188,12 +188,6 @@ def check_minimum(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
             f"{points[k].tolist()}, where Newton's method has not converged; give controls a larger R."
         )
     return MINIMISED.format(BACKWARD, MINIMA)
-
-
-def _random_points(domain: tuple[Corner, Corner], count: int) -> Tensor:
-    lower, upper = domain
-    share = torch.rand(count, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
-    return lower + (upper - lower) * share
 
 
 @dataclass

@@ -27,7 +27,7 @@ from lyapnet.task.sets import Box
 
 Sliced = ProvedFunnel | ProvedRegion | ProvedReach  # claims that are drawn in slices
 
-NEAR = 0.02  # of D's widths: a point this close to a slice is drawn as a point of it
+NEAR = 0.02  # distance from a slice, relative to D's widths, up to which a counterexample is drawn as a point of it
 
 
 # Sampled states
@@ -36,7 +36,7 @@ NEAR = 0.02  # of D's widths: a point this close to a slice is drawn as a point 
 def sampled_states(claim: CountedSuccesses, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
     """The sampled states of X₀ by their outcome, projected onto the plane of the two widest components of X₀.
 
-    If only one component has a width, a histogram.
+    If only one component has a width, they are drawn as a histogram.
 
     Args:
         labels: names of the states with their units.
@@ -402,7 +402,7 @@ def _draw_sublevel(
     """Draw the set {excess ≤ 0}."""
     if filled and excess.min() <= 0:
         panel.contourf(*grid, excess, levels=[excess.min() - 1, 0], colors=[colour], alpha=0.25)
-    if excess.min() < 0 < excess.max():  # otherwise matplotlib warns that there is no line to draw
+    if excess.min() < 0 < excess.max():  # otherwise there is no line, and matplotlib warns
         panel.contour(*grid, excess, levels=[0], colors=[colour], linewidths=1.2, linestyles=style)
 
 

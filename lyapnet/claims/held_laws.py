@@ -1,4 +1,4 @@
-"""Claims about a law that is read at times and held: its readings from the options, as facts and in words."""
+"""Claims about a law that is read at certain times and held: readings from the options, as numbers and in words."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,17 +15,17 @@ from lyapnet.task.varying_limits import VaryingLimits
 
 
 def held_options(claim: ReadAtTimes) -> list[str]:
-    """The options of a claim that are about a held law."""
+    """The names of the given options that are about a held law."""
     names = ("interval", "jitter", "delay", "measured", "quantised", "file")
     return [name for name in names if getattr(claim, name, None)]
 
 
 def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forever: bool = False) -> Readings | None:
-    """When the law is read, and how far this may be off; None for a claim about u read at every t.
+    """The readings of the law; None for a claim about u read at every t.
 
     Args:
-        made_for: "continuous" or "held", if the claim does not say it; continuous where no held law is covered.
-        forever: whether the law is read as u(0, x).
+        made_for: "continuous" or "held", used if the claim does not say which; "held" only for tasks that allow it.
+        forever: whether the law is u(0, x), used without end.
 
     Raises:
         UsageError: options of a held law for one that is read at every t, a name is unknown, there are constraints, or
@@ -56,11 +56,11 @@ def readings_of(claim: ReadAtTimes, controller: Controller, made_for: str, forev
 
 
 READ_THEN = {"continuous": "u is then read at every t", "steps": "u is then read in each step of the model"}
-"""When u is read where it is no held law."""
+"""Value of `time` ↦ when u is read, for messages."""
 
 
 def _reason_against(problem: Problem) -> str | None:
-    """The message that refuses claims about held laws of a task; None if they cover it."""
+    """The message that refuses a claim about a held law for this task; None if there is no reason to."""
     if problem.constraints is not None:
         return "Expected no state constraints for a law that is held, got some; add --time continuous."
     if isinstance(problem.controls, VaryingLimits):
@@ -72,7 +72,7 @@ def _reason_against(problem: Problem) -> str | None:
 
 
 def readings_facts(readings: Readings | None, system: ControlSystem) -> dict[str, Any]:
-    """When u is read, by the keys of a certificate's result; none where it is read at every t."""
+    """The readings by the keys of a certificate's result; empty if u is read at every t."""
     if readings is None:
         return {}
     return {
@@ -83,7 +83,7 @@ def readings_facts(readings: Readings | None, system: ControlSystem) -> dict[str
 
 
 def _computed_facts(readings: Readings, system: ControlSystem) -> dict[str, Any]:
-    """The program that computes u; nothing for real numbers."""
+    """The program that computes u, by the keys of a certificate's result; empty for real numbers."""
     computed = readings.computed
     if computed is None:
         return {}
@@ -104,7 +104,7 @@ READINGS = {
 
 
 def readings_text(readings: Readings | None, system: ControlSystem) -> str:
-    """When u is read, in words."""
+    """The readings in words."""
     if readings is None:
         return "with u read at every t"
     delay = ""
@@ -120,10 +120,10 @@ def readings_text(readings: Readings | None, system: ControlSystem) -> str:
 
 
 def computed_text(readings: Readings | None, system: ControlSystem, left_out: Sequence[int]) -> str:
-    """That a file computes u, as a sentence; empty for real numbers.
+    """A sentence on the program that computes u; empty for real numbers.
 
     Args:
-        left_out: states that nothing depends on.
+        left_out: states on which nothing depends.
     """
     computed = None if readings is None else readings.computed
     if computed is None:
@@ -145,10 +145,10 @@ def computed_text(readings: Readings | None, system: ControlSystem, left_out: Se
 
 
 def control_of(readings: Readings, law: str) -> str:
-    """The control of a reading as a formula, with the errors that are not 0.
+    """The control of a reading as a formula, with e and r if there are such errors.
 
     Args:
-        law: the law with {} in the place of the error.
+        law: the law, with {} where e is added.
     """
     return law.format(" + e" * any(readings.errors)) + " + r" * any(readings.control_errors)
 

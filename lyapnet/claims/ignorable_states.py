@@ -1,4 +1,4 @@
-"""Ignorable states: no function in a certificate depends on them, so that it need not bound them."""
+"""Ignorable states: no function in a certificate depends on them, so a claim need not bound them."""
 
 import torch
 
@@ -14,8 +14,8 @@ from lyapnet.value.policy import ValuePolicy
 def ignorable_states(closed_loop: ClosedLoop, constraints: Constraints | None = None) -> list[int]:
     """The indices of the states on which none of f, g, ℓ, φ, V, u, h and σ depends.
 
-    The state is set to nan: a result that stays finite does not depend on it. Jumps would hide the nan, since nan > 0
-    is false and the sign of nan is 0; if there are jumps, no state counts as ignorable.
+    A state is set to nan; results without nan do not depend on it. Jumps would hide the nan, since nan > 0 is false and
+    the sign of nan is 0; if there are jumps, no state counts as ignorable.
     """
     if has_jumps(closed_loop):
         return []
@@ -38,7 +38,7 @@ def _depends_on(closed_loop: ClosedLoop, i: int) -> bool:
 def has_jumps(closed_loop: ClosedLoop) -> bool:
     """Whether f, g, ℓ, φ, V or u may jump: one of their operators jumps or compares, or they cannot be traced.
 
-    Newton's method for u compares, which need not be traced to be known.
+    A u that is no closed form counts as one that jumps, because Newton's method compares numbers.
     """
     policy = closed_loop.policy
     if isinstance(policy, ValuePolicy) and not reads_as_written(policy):
@@ -53,13 +53,13 @@ def has_jumps(closed_loop: ClosedLoop) -> bool:
 
 
 def _generic_point(closed_loop: ClosedLoop) -> tuple[torch.Tensor, torch.Tensor]:
-    """A point (t, x) without zeros: an entry that is 0 by chance might hide a nan that is multiplied by it."""
+    """A point (t, x) without zeros."""
     x = 0.1 + 0.01 * torch.arange(closed_loop.system.n, dtype=torch.float64).sqrt()
     return x.new_tensor(0.01), x
 
 
 def _parts_without_cost(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """The values in the condition and V, without q and φ: a quadratic cost is checked by its matrices."""
+    """σ, f, g, f + gu, R, V and u at a point; without q and φ, as a quadratic cost is checked by its matrices."""
     system, V, u = closed_loop.system, closed_loop.V, closed_loop.policy(t, x)
     assert V is not None
     noise = [] if closed_loop.noise is None else [closed_loop.noise(x)]

@@ -1,4 +1,4 @@
-"""Reads the file of a region's proof: the numbers that are to be proved again."""
+"""Reads the file of a region's proof: the numbers that a check proves again."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ REMEDY = f"allow more seconds, or {NEW_FILE}"
 
 
 class KeptRegion(NamedTuple):
-    """The numbers of a region in a file: those to prove again, and the result that it records."""
+    """The numbers in the file of a region's proof: those that define the claim, and the recorded result."""
 
     path: Path
     decay: float  # λ in 1/s
@@ -78,10 +78,14 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
 
     def level(self, contracts: bool, rim: float) -> float:
-        """The level up to which the proof searched, if V is above it on the boundary of D.
+        """The level up to which the proof searched; refused unless V is above it on the boundary of D.
 
         Args:
             contracts: whether contraction on B was proved again, or is not needed.
+            rim: a lower bound of V on the boundary of D.
+
+        Raises:
+            UsageError: contraction is not proved again, or the level is not below rim.
         """
         fact = f"V > ρ = {self.wanted!r} on the boundary of D" if contracts else "F that contracts on B"
         if not contracts or not self.wanted < rim:
@@ -90,7 +94,7 @@ class KeptRegion(NamedTuple):
 
 
 def kept_region(path: Path) -> KeptRegion:
-    """Read the file of a region's proof; nothing is bounded.
+    """Read the file of a region's proof, without checking it.
 
     Raises:
         UsageError: the file is not one of a region's proof.

@@ -1,6 +1,6 @@
-"""The kinds of claims: their options and `establish`, which imports torch and the proof only when it is called.
+"""The kinds of claims: their options, and `establish`, which imports torch and the proof only when it is called.
 
-A new kind is a class like these with a certificate of its own; no other code needs to know it.
+A new kind is a class like these with its own certificate; no other code needs to change.
 """
 
 from collections.abc import Mapping, Sequence

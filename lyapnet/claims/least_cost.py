@@ -1,4 +1,4 @@
-"""A lower bound of the optimal cost: a V that along no control rises faster than ℓ proves it."""
+"""A lower bound of the optimal cost, proved by a V that falls at most at the rate ℓ under every control."""
 
 import time
 from collections.abc import Callable
@@ -27,25 +27,25 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet, about_control
 from lyapnet.value.calculus import drift_lie_derivative, gradients, input_lie_derivative
 
-EXCESS_TOLERANCE = 5e-5  # accuracy of the bound of e, as a share of the level
-DEGREE = 3  # of the Taylor forms: V_t and the Hamiltonian cancel in terms of third order, t·x²
+EXCESS_TOLERANCE = 5e-5  # largest error of the bound of e, relative to the level
+DEGREE = 3  # of the Taylor forms: in V_t plus the Hamiltonian, terms up to third order cancel, such as t·x²
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedLowerBound:
-    """With W(t, x) = β V(t, x) − δ(T − t) and 0 < β ≤ 1: at every (t, x) in [0, T] × D with W ≤ c, in continuous time,
+    """With W(t, x) = β V(t, x) − δ(T − t) and 0 < β ≤ 1, at every (t, x) in [0, T] × D with W ≤ c, in continuous time,
 
         β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)] ≥ −δ,
 
     and min(W, c) ≤ φ + e' at T on D. Under any control, m = min(W, c) then falls along a trajectory in D by at most
-    ∫ℓ + e'': where W < c, by the condition; where W ≥ c, since m is constant and ℓ ≥ −e''/T, because q is bounded from
-    below and R is positive definite on D. Hence, with e = e' + e'',
+    ∫ℓ + e'': where W < c by the condition, and where W ≥ c because m is constant there and ℓ ≥ −e''/T (q is bounded
+    from below and R is positive definite on D). Hence, with e = e' + e'',
 
         J(x₀) = ∫ℓ dt + φ(x(T)) ≥ min(β V(0, x₀) − δT, c) − e
 
-    for every control that keeps the state in D. If also W > c on the boundary of D and φ ≥ c outside of D, then m = c
-    continues m outside, where every cost has ℓ ≥ 0, and the bound holds for every control (`everywhere`). This is
-    checked if q and φ are quadratic forms about a target in D, because φ then increases along each ray from it.
+    for every control that keeps the state in D. If also W > c on the boundary of D and φ ≥ c outside of D, then m can
+    be set to c outside of D, where ℓ ≥ 0, and the bound holds for every control (`everywhere`). This is checked if q
+    and φ are quadratic forms about a target in D, because φ then increases along each ray from it.
 
     State constraints can only increase the optimum. Along ignorable states D is all of ℝ. The parameters of a family
     are constant.
@@ -86,11 +86,10 @@ class ProvedLowerBound:
 
 
 class RiseCondition(DecreaseCondition):
-    """c(t, x) = −(β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)]) − δ. Where c ≤ 0, W falls by
-    at most ∫ℓ dt under any control.
+    """c(t, x) = −(β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)]) − δ; where c ≤ 0, Ẇ ≥ −ℓ under any control.
 
-    The third part is minus the least pivot of R(x), so that the proof of c also proves that R is positive definite;
-    otherwise the minimum would not exist.
+    The third part is minus the least pivot of R(x), so that the proof also shows that R is positive definite, without
+    which there is no minimum.
     """
 
     proves = "below"
@@ -129,13 +128,14 @@ class RiseCondition(DecreaseCondition):
 
 
 def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: ControlSet) -> PerState:
-    """min over u ∈ U of h(u) = (u − u*)ᵀR(u − u*) + bᵀu for symmetric positive definite R, or less.
+    """A lower bound of min over u ∈ U of h(u) = (u − u*)ᵀR(u − u*) + bᵀu for symmetric positive definite R.
 
-    Without limits it is bᵀu* − ¼ bᵀR⁻¹b. With limits, h lies above its tangent at any û, here that of the control law:
+    Without limits it is the minimum bᵀu* − ¼ bᵀR⁻¹b. With limits, h lies above its tangent at any û, here that of the
+    control law:
 
         h(u) ≥ h(û) + Σ_i min over lower_i ≤ u_i ≤ upper_i of h_i (u_i − û_i),   h_i = (2R(û − u*) + b)_i,
 
-    which is h(û) if û is the minimiser, and a lower bound for any û.
+    which is the minimum if û is the minimiser, and a lower bound for any û.
     """
     u0 = b.new_zeros(()) if rest is None else rest.to(b)
     if not controls.limited:
@@ -149,7 +149,7 @@ def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: Co
 
 
 def symmetric(R: Tensor) -> Tensor:
-    """The symmetric part of R, which alone matters in uᵀRu."""
+    """The symmetric part of R, which determines uᵀRu."""
     return (R + R.mT) / 2
 
 
@@ -174,7 +174,7 @@ def prove_lower_bound(
     keep: Path | None = None,
     replay: bool = False,
 ) -> ProvedLowerBound:
-    """Prove a lower bound of the optimal cost by V within a budget, for as much of X₀ as possible.
+    """Prove a lower bound of the optimal cost by V, for as much of X₀ as the budget allows.
 
     Args:
         closed_loop: gives V, the system and the cost; its control law is not used.
@@ -216,7 +216,7 @@ def prove_lower_bound(
 
 
 def require_bound_from_below(closed_loop: ClosedLoop, problem: Problem, beta: float, states: Box | None) -> None:
-    """Refuse a cost, limits or a set D that prove_lower_bound would refuse."""
+    """Refuse a cost, limits or a set D that prove_lower_bound refuses."""
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, 0.0, copied(problem))
     if states is not None:
         left_out = ignorable_states(condition.closed_loop, problem.constraints)
@@ -227,7 +227,7 @@ def require_bound_from_below(closed_loop: ClosedLoop, problem: Problem, beta: fl
 def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget) -> float:
     """An upper bound of e; ∞ if R is not proved to be positive definite on D.
 
-    If q is a quadratic form, q ≥ 0 and e'' = 0.
+    If q is a quadratic form about a target, q ≥ 0 and e'' = 0.
     """
     cost, T, beta = condition.closed_loop.cost, condition.duration, condition.alpha
     end, unit = at_time(T, states.lower, states.upper), max(abs(level), 1e-12)
@@ -250,7 +250,7 @@ def _require_still(condition: RiseCondition, domain: tuple[Corner, Corner]) -> N
 
 
 def rises_along_rays(cost: Cost, goal: State, states: Box, left_out: list[int]) -> bool:
-    """Whether φ is known to increase along each ray from a target in D, since it is a quadratic form about it."""
+    """Whether φ is a quadratic form about a target in D, so that it increases along each ray from there."""
     inside = ((states.lower < goal) & (goal < states.upper)).index_fill(
         0, torch.tensor(left_out, dtype=torch.long), True
     )

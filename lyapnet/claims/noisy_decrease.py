@@ -1,4 +1,4 @@
-"""The condition of a funnel under noise, to be proved on boxes."""
+"""The condition of a funnel under noise, which a proof bounds on boxes."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
 from lyapnet.prover.condition import DecreaseCondition, own_operations
 from lyapnet.value.calculus import noise_derivative, time_derivative
 
-LEAK_SHARE = 0.1  # share of 1 − p for closed loops that leave from where V is low
+LEAK_SHARE = 0.1  # share of 1 − p for closed loops that leave from low V, where the second inequality has the slack η
 
 
 class NoisyDecrease(DecreaseCondition):
@@ -22,14 +22,14 @@ class NoisyDecrease(DecreaseCondition):
         s(y) = S min(max(1 + y − ln(S/η), 0), 1) ≤ η e^y,     S = aρ + δ.
 
     By Itô's formula 𝓛V is the mean of dV/dt, and for Z = exp(λ(V − r)) that of dZ/dt is λZ(𝓛V − ṙ + ½ λ ‖σᵀV_x‖²).
-    So where c ≤ 0, V + ∫(αℓ − δ) dt and Z − ληt are supermartingales. s leaves room where V is low, from where a
-    closed loop hardly leaves {V ≤ r}; it stands for η e^y, whose bounds on boxes are wide.
+    So where c ≤ 0, V + ∫(αℓ − δ) dt and Z − ληt are supermartingales. The slack s allows V to rise where it is low,
+    from where a closed loop hardly leaves {V ≤ r}. It is used instead of η e^y, whose bounds on boxes are wide.
 
     Args:
         closed_loop: the system with its noise σ, its cost, and a control law that V defines.
         alpha, delta: α and δ.
         decay: a ≥ 0, in 1/s, at which the funnel narrows.
-        probability: that of staying in the funnel {V ≤ r}, from which `aim` sets ρ and η.
+        probability: p, the probability of staying in the funnel {V ≤ r}, from which `aim` computes ρ and η.
         duration: T in s.
     """
 
@@ -54,9 +54,9 @@ class NoisyDecrease(DecreaseCondition):
         self.risk, self.largest, self.level, self.leak = 0.0, math.nan, math.inf, math.inf
 
     def aim(self, risk: float, largest: float) -> None:
-        """Set λ, and for it ρ and η, so that closed loops from V(0, x₀) ≤ largest leave with probability 1 − p at most.
+        """Set λ, and ρ and η so that closed loops from V(0, x₀) ≤ largest leave with a probability of at most 1 − p.
 
-        exp(−λ(ρ − largest)) is 90 % of 1 − p, and ληT the rest.
+        exp(−λ(ρ − largest)) is 90 % of 1 − p, and ληT is the rest.
         """
         if not 0 < risk < math.inf:
             raise UsageError(f"Expected risk > 0, got {risk}; give it in 1/cost.")

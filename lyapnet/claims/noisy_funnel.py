@@ -27,7 +27,7 @@ from lyapnet.claims.noisy_decrease import NoisyDecrease, require_smooth
 from lyapnet.claims.preconditions import over_time, require_still
 from lyapnet.claims.ultimate_bound import extent_of
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.boxes import faces
+from lyapnet.prover.boxes import faces, random_points
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.condition import DecreaseCondition, own_constraints
 from lyapnet.prover.kept_proofs import read_proofs, refuse_bad_file, select_proof
@@ -37,18 +37,18 @@ from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-SAMPLES = 40_000  # points (t, x) from which λ is chosen, for each box
+SAMPLES = 40_000  # number of points (t, x), for each box, from which λ is chosen
 LEVEL_FACTORS = (1.25, 1.5, 2.0, 3.0, 5.0, 8.0)  # levels whose boxes are tried for λ, relative to max V(0, ·) on X₀
 RISKS = torch.logspace(3, -2, 81, dtype=torch.float64)  # values of λ to try, relative to 1/max V(0, ·) on X₀
-LARGEST_EXPONENT = 700.0  # an exponent whose exp is a float, and above which nothing is claimed
-SAMPLE_MARGIN = 0.15  # of λ: samples have to allow as much more, since bounds need some room
+LARGEST_EXPONENT = 700.0  # limit of exponents; exp(700) is still a float64, and probabilities are 1 long before
+SAMPLE_MARGIN = 0.15  # relative increase of ½ λ ‖σᵀV_x‖² at samples, since bounds are less tight than values
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedNoisyFunnel(ProvedFunnel):
-    """For dx = (f + g u) dt + σ(x) dW, with V twice continuously differentiable in x and r(t) = ρ e^(−at): at every
-    (t, x) in [0, T] × D with W = V e^(at) ≤ ρ', in continuous time and for this model, with 𝓛V = V_t + V_xᵀ(f + g u) +
-    ½ tr(σσᵀV_xx),
+    """For dx = (f + g u) dt + σ(x) dW, with V twice continuously differentiable in x, r(t) = ρ e^(−at), W = V e^(at)
+    and 𝓛V = V_t + V_xᵀ(f + g u) + ½ tr(σσᵀV_xx), at every (t, x) in [0, T] × D with W ≤ ρ', in continuous time and for
+    this model,
 
         𝓛V + α ℓ(x, u) ≤ δ     and     𝓛V + ½ λ ‖σᵀV_x‖² ≤ ṙ + η exp(λ(r − V)),
 
@@ -64,7 +64,7 @@ class ProvedNoisyFunnel(ProvedFunnel):
     is not left.
 
     ρ (`wanted`) and η are such that closed loops from all of X₀ stay in the funnel of ρ' = ρ at least with a given
-    `probability`, and the verdict is about it. For every verdict, closed loops from the share `volume_share` of X₀ do
+    `probability`; the verdict is on this claim. For every verdict, closed loops from the share `volume_share` of X₀ do
     so in the funnel of the largest proved level ρ' (`rho`).
 
     Ignorable states, and the parameters of a family, are as for a funnel without noise.
@@ -123,13 +123,13 @@ def prove_noisy_funnel(
     replay: bool = False,
     degree: int = 2,
 ) -> ProvedNoisyFunnel:
-    """Prove the funnel that closed loops from X₀ leave with a small probability, or the largest that a budget allows.
+    """Prove the funnel that closed loops from X₀ leave with a small probability, or the largest one that is possible.
 
     Args:
         closed_loop: a closed loop with a V and noise; the claim is about its float64 copy.
         problem: gives X₀, T, the goal and the constraints.
-        probability: that of staying in the funnel up to T, from each state of X₀.
-        risk: λ; by default the largest that samples of the funnel allow, with some room.
+        probability: the probability of staying in the funnel up to T, from each state of X₀.
+        risk: λ; by default the largest that samples of the funnel allow, with a margin.
         decay: a ≥ 0, at which the funnel narrows.
         states: D; by default a box around the funnel, estimated from samples.
         report, keep, replay, degree: as in prove.
@@ -193,9 +193,9 @@ def prove_noisy_funnel(
 
 
 def kept_largest(path: Path | None, condition: DecreaseCondition) -> float | None:
-    """The bound of max V(0, ·) on X₀ in a file, which may be the result of fewer boxes than there is time for now.
+    """The bound of max V(0, ·) on X₀ that a file records, None if there is no file.
 
-    None without a file, or before it exists.
+    It defines the condition of the proof; a bound with more boxes may be lower now.
 
     Raises:
         UsageError: the file holds another proof.
@@ -208,7 +208,7 @@ def kept_largest(path: Path | None, condition: DecreaseCondition) -> float | Non
 
 
 def _likely_level(condition: NoisyDecrease, rho: float) -> float:
-    """The V(0, x₀) up to which closed loops stay with the probability asked for, if only ρ' = rho is proved; or −∞."""
+    """The V(0, x₀) up to which closed loops stay with the wanted probability, if only ρ' = rho is proved; or −∞."""
     exponent = min(condition.risk * (condition.level - rho), LARGEST_EXPONENT)
     later = condition.risk * condition.leak * condition.duration * math.exp(exponent)
     start = 1 - condition.probability - later
@@ -228,9 +228,9 @@ def levels_of_constraints(
 
 
 def choose_risk(condition: NoisyDecrease, boxes: Iterable[Box], duration: float, largest: float) -> None:
-    """Aim at the largest λ, and so the lowest funnel, for which the condition of leaving holds at samples.
+    """Set λ to the largest one, with the lowest funnel, for which the second term of c is ≤ 0 at samples.
 
-    If it holds for none, the one with the lowest share of failures is taken.
+    If there is none, take the one with the lowest share of failures.
 
     Args:
         boxes: sets of states that are sampled in turn until a λ is found whose funnel they contain.
@@ -254,10 +254,9 @@ def choose_risk(condition: NoisyDecrease, boxes: Iterable[Box], duration: float,
 def _sample_rates(
     condition: NoisyDecrease, box: Box, duration: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """(t, V, W, 𝓛V, ‖σᵀV_x‖²) at random points of [0, T] × D, and the least W at some of its boundary in the middle."""
+    """(t, V, W, the least W at points of the boundary, 𝓛V, ‖σᵀV_x‖²) at random points of [0, T] × D."""
     (lower, upper), generator = over_time(box, duration), torch.Generator().manual_seed(0)
-    share = torch.rand(SAMPLES, len(lower), generator=generator, dtype=torch.float64)
-    t, x = (lower + (upper - lower) * share).tensor_split([1], -1)
+    t, x = random_points(lower, upper, SAMPLES, generator).tensor_split([1], -1)
     axes = [1 + i for i in range(box.dimension) if upper[1 + i] > lower[1 + i]]
     least, greatest = faces(lower, upper, axes)
     share = torch.rand(SAMPLES // 10, len(lower), generator=generator, dtype=torch.float64)

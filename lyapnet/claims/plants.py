@@ -1,4 +1,4 @@
-"""One control law on all plants of a box of parameters, as one closed loop with the parameters as constant states."""
+"""One control law for all plants of a box of parameters, as one closed loop with the parameters as constant states."""
 
 import inspect
 import math
@@ -24,15 +24,15 @@ from lyapnet.task.systems import ControlSystem
 from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
-TRIED = 8  # random states at which plants are compared with systems built with their parameters
+TRIED = 8  # number of random states at which plants are compared with systems built with their parameters
 
 
 @dataclass(frozen=True)
 class Plants:
     """ẋ = f(x; p) + g(x; p)u(x) for each constant p in a box P, where u and V were made for one nominal plant.
 
-    With z = (x, p) and ṗ = 0 it is one closed loop with constants, like that of a family. Unlike those of a family, u
-    and V depend on x alone: the law uses f, g and R of the nominal plant, which is a separate object.
+    With z = (x, p) and ṗ = 0 this is one closed loop with constants, like that of a family. But here u and V depend on
+    x alone: the law uses f, g and R of the nominal plant, which is a separate object.
     """
 
     system: FamilySystem  # in z
@@ -63,7 +63,7 @@ class Plants:
         return torch.cat([w, w.new_zeros(self.box.dimension)])
 
     def readings_of_all(self, readings: Readings) -> Readings:
-        """Readings of x as those of z, without errors of p."""
+        """Readings of x as readings of z, without errors of p."""
         return replace(readings, errors=(*readings.errors, *[0.0] * self.box.dimension))
 
     def all_of(self, loop: ClosedLoop, problem: Problem) -> tuple[ClosedLoop, Problem]:
@@ -78,8 +78,9 @@ class Plants:
 
 
 def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> Plants:
-    """The plants of a controller's system with parameters in these ranges; compared with systems that the constructor
-    builds.
+    """The plants of a controller's system with parameters in these ranges.
+
+    At random states they are compared with systems that the constructor builds.
 
     Args:
         ranges: name of a constructor argument that f and g read as self.NAME ↦ [lower, upper].
@@ -94,7 +95,7 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
         raise UsageError(
             f"Expected constant limits of controls with {OPTION}, got {controller.controls.words}; leave it out."
         )
-    system = copied(controller.system)  # a copy, so that changes of its parameters do not reach the law
+    system = copied(controller.system)  # changes of its parameters must not change the law
     _require_arguments(system, ranges)
     lower, upper = (torch.tensor([ends[i] for ends in ranges.values()], dtype=torch.float64) for i in (0, 1))
     plants = Plants(

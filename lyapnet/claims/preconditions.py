@@ -13,13 +13,14 @@ from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Corner, Corners, State, Time, Value
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.boxes import random_points
 from lyapnet.prover.branches import JUMPS
 from lyapnet.prover.condition import DecreaseCondition, OwnOperations, own_constraints
 from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 
-ROUNDING_OF_ZERO = 1e-200  # bounds of 0 differ from 0 by a tiny margin for rounding
+ROUNDING_OF_ZERO = 1e-200  # largest bound of a rate that counts as 0; bounds of 0 have a tiny margin for rounding
 
 
 def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memory:
@@ -42,10 +43,10 @@ def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memor
 def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Corner, Corner]) -> Memory:
     """Refuse a closed loop that remembers calls, or whose results depend on the size of the batch.
 
-    The loop is called here before it is traced, so that lazily computed attributes exist.
+    The loop must not be traced before: these calls make its lazily computed attributes.
     """
     lower, upper = domain
-    points = _points(lower, upper)
+    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
     ends = Box(lower, upper).ends(TRIED)
 
     def everything(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
@@ -54,7 +55,7 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
         results += [] if V is None else [V(t, x)]
         results += [] if constraints is None else [constraints(x)]
         results += [] if loop.noise is None else [loop.noise(x)]
-        # methods that are inherited from the base class follow from V(t, x) and policy(t, x)
+        # methods inherited from the base class follow from V(t, x) and policy(t, x)
         if V is not None and type(V).value_and_state_gradient is not ValueFunction.value_and_state_gradient:
             results.append(V.value_and_state_gradient(t, x)[1])
         if reaches_own_code(getattr(type(policy), "with_value", None)):
@@ -74,17 +75,11 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     return memory
 
 
-def _points(lower: Corner, upper: Corner) -> Tensor:
-    """Random points of a box."""
-    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
-    return lower + (upper - lower) * share
-
-
 def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
-    """Refuse a condition that is another function on batches, on which closed loops run, than on one point."""
+    """Refuse a condition whose values on batches, which closed loops use, differ from those at single points."""
     lower, upper = domain
     _require_constant(condition.closed_loop, domain)
-    points = _points(lower, upper)
+    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
 
     def all_three(t: Tensor, x: Tensor) -> Tensor:
         return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
@@ -161,7 +156,7 @@ def _close(one: Tensor, other: Tensor) -> bool:
 
 
 def require_continuous(V: Value, x_low: State, x_high: State) -> None:
-    """Refuse a V that may jump: its gradient does not show jumps, so that W could rise although c ≤ 0."""
+    """Refuse a V that may jump: W could rise at a jump although c ≤ 0, since the gradient does not show it."""
     lower, upper = at_time(0.0, x_low, x_high)
     jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
     if jumps:
@@ -211,10 +206,10 @@ def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
 def require_still(
     rates: Callable[[Time, State], tuple[Tensor, ...]], domain: tuple[Corner, Corner], under: str = ""
 ) -> None:
-    """Refuse constants whose rates are not 0; this is needed since the faces of D along them are not checked.
+    """Refuse constants whose rates are not 0, since claims assume that no closed loop leaves D along them.
 
     Args:
-        under: the controls in question, in words.
+        under: the controls for which this is tested, in words.
     """
     bounds = BoundedFunction(rates, domain).bounds(*(end[None] for end in domain))
     if not all(bool(torch.maximum(-low, high).max() <= ROUNDING_OF_ZERO) for low, high in bounds):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
-from lyapnet.base.types import Corner, PerState, Points
+from lyapnet.base.types import PerState, Points
 from lyapnet.claims.funnel import (
     budget_for_level,
     enclosing_box,
@@ -33,7 +33,7 @@ from lyapnet.claims.noisy_funnel import (
 from lyapnet.claims.preconditions import at_time, over_time
 from lyapnet.claims.reach_decrease import OutsideBox, ReachDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.boxes import faces
+from lyapnet.prover.boxes import faces, random_points
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.proof import Progress, Proof
@@ -42,14 +42,14 @@ from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-SHARE_OF_RATE = 0.5  # ε by default, as a share of what samples allow: bounds need the rest
-LEAST_RATE = 1e-3  # ε by default where samples allow none, as a share of max V on X₀ over T
+SHARE_OF_RATE = 0.5  # default of ε as a share of the largest ε at samples, since bounds are less tight than values
+LEAST_RATE = 1e-3  # default of ε if samples allow none, as a share of max V on X₀ over T
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedReach:
     """For dx = (f + g u) dt + σ(x) dW with u = u(0, x) at every time, and V(x) = V(0, x) twice continuously
-    differentiable: at each x ∈ D outside of the interior of the target G, with V(x) ≤ ρ', for this model and in
+    differentiable, at each x ∈ D outside of the interior of the target G with V(x) ≤ ρ', for this model and in
     continuous time,
 
         𝓛V + ½ λ ‖σᵀV_x‖² ≤ −ε,     𝓛V = V_xᵀ(f + g u) + ½ tr(σσᵀV_xx),
@@ -63,12 +63,12 @@ class ProvedReach:
 
     Nothing is claimed about what happens after τ.
 
-    ρ (`wanted`) is such that closed loops from all of X₀ reach the target with a given `probability`, and the verdict
-    is about it. For every verdict, closed loops from the share `volume_share` of X₀ do so, by the largest proved ρ'
+    ρ (`wanted`) is such that closed loops from all of X₀ reach the target with a given `probability`; the verdict is on
+    this claim. For every verdict, closed loops from the share `volume_share` of X₀ do so, by the largest proved ρ'
     (`rho`).
     """
 
-    probability: float  # of reaching the target, that is to be proved
+    probability: float  # the probability of reaching the target that is to be proved
     risk: float  # λ in 1/cost
     rate: float  # ε in cost per second
     target: Box  # G
@@ -86,8 +86,8 @@ class ProvedReach:
     constraints: Sequence[str] = ()
     set_up: float = 0.0  # seconds of the budget before the first box
     assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
-    noise: Mapping[str, float] | None = None  # σ by states, per √s; None: that of the task
-    left_out: Sequence[int] = ()  # ignorable states: none here
+    noise: Mapping[str, float] | None = None  # σ by state, per √s; None: that of the task
+    left_out: Sequence[int] = ()  # ignorable states; this claim allows none
 
     def reach_probability(self, value: PerState) -> PerState:
         """The lower bound of P(reach the target before leaving) as a function of V(0, x₀), (*batch,)."""
@@ -109,7 +109,7 @@ class ProvedReach:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict on the claim that closed loops from all of X₀ reach the target with the probability asked for."""
+        """The verdict on the claim that closed loops from all of X₀ reach the target with the wanted probability."""
         found = self.counterexample
         return verdict_on(self.rho, self.wanted, None if found is None else found.height, self.least)
 
@@ -153,11 +153,11 @@ def prove_reach(
         closed_loop: a closed loop with a V and noise; the claim is about its float64 copy.
         problem: gives X₀, the constraints and the goal.
         target: G, with an interior.
-        avoided: boxes that closed loops do not meet before they are in G.
+        avoided: boxes that closed loops must not meet before they are in G.
         risk, rate: λ and ε; by default chosen from samples of D.
         states: D; by default a box around a sublevel set, estimated from samples.
         report, keep, replay: as in prove.
-        named: σ by states, where it is not the noise of the task: a kept proof records it.
+        named: σ by state, if it is not the noise of the task, for the kept proof.
 
     Raises:
         UsageError: the task has no noise, V is not smooth, the sets, λ or ε are unsuitable, the system is a family or
@@ -214,7 +214,7 @@ def prove_reach(
 
 
 def _of_states(box: Box, n: int) -> Box:
-    """A box in float64, of as many states as the system has."""
+    """A box in float64; refused unless it has n states."""
     if box.dimension != n:
         raise UsageError(f"Expected boxes of {n} states, got {box.dimension}; give bounds for each state.")
     return Box(box.lower.double(), box.upper.double())
@@ -226,7 +226,7 @@ def _require_interior(target: Box) -> None:
 
 
 def _require_away_from(initial_states: Box, target: Box, avoided: Sequence[Box]) -> None:
-    """Refuse a box to avoid in which closed loops begin that are not yet in the target."""
+    """Refuse a box to avoid that contains states of X₀ outside of the target."""
     for box in avoided:
         lower = torch.maximum(box.lower, initial_states.lower.double())
         upper = torch.minimum(box.upper, initial_states.upper.double())
@@ -257,15 +257,16 @@ def choose_risk_and_rate(
     largest: float,
     duration: float,
 ) -> None:
-    """Aim at λ and ε that samples of {V ≤ ρ} outside of the target allow, those that are not given.
+    """Set λ and ε, or the one that is not given, by samples of {V ≤ ρ} outside of the target.
 
-    λ is the middle of those that are possible: the larger it is, the smaller is the set, and the steeper the condition.
-    ε is half of what is possible with it. Where none is possible, λ is the one with the lowest share of failures.
+    λ is the middle one of those for which the condition holds at all samples: a larger λ makes the set smaller and the
+    condition harder. ε is half of what samples allow with it. If there is none, λ is the one with the lowest share of
+    failures.
 
     Args:
         boxes: sets of states that are sampled in turn until a λ is found whose sublevel set they contain.
         largest: max V(0, ·) on X₀.
-        duration: T in s, for an ε where samples allow none.
+        duration: T in s, for an ε if samples allow none.
     """
     least_rate = LEAST_RATE * max(abs(largest), 1e-6) / duration
     risks = [risk] if risk is not None else (RISKS / max(abs(largest), 1e-6)).tolist()
@@ -292,23 +293,18 @@ def choose_risk_and_rate(
 
 
 def _sample_rates(condition: ReachDecrease, box: Box) -> tuple[Tensor, Tensor, Tensor, float]:
-    """(V, 𝓛V, ‖σᵀV_x‖²) at random points of D outside of the target, and the least V at some of its boundary and of
-    the boxes to avoid.
+    """(V, 𝓛V, ‖σᵀV_x‖²) at random points of D outside of the target; the least V at points of its boundary and of the
+    boxes to avoid.
     """
     generator = torch.Generator().manual_seed(0)
     lower, upper = (side.double() for side in (box.lower, box.upper))
-    x = _drawn(lower, upper, SAMPLES, generator)
+    x = random_points(lower, upper, SAMPLES, generator)
     x = x[OutsideBox(condition.target).worst(x) <= 0]
     sides = zip(*faces(lower, upper, range(box.dimension)), strict=True)
     parts = [*sides, *((torch.maximum(b.lower, lower), torch.minimum(b.upper, upper)) for b in condition.avoided)]
-    edge = [_drawn(low, high, SAMPLES // 10, generator) for low, high in parts if bool((low <= high).all())]
+    edge = [random_points(low, high, SAMPLES // 10, generator) for low, high in parts if bool((low <= high).all())]
     rim = torch.cat(edge)
     with torch.no_grad():
         now = x.new_zeros(len(x))
         V_rim = condition.V(x.new_zeros(len(rim)), rim)
         return condition.V(now, x), *condition.rates(now, x), float(V_rim.min())
-
-
-def _drawn(lower: Corner, upper: Corner, count: int, generator: torch.Generator) -> Tensor:
-    """Random points of a box."""
-    return lower + (upper - lower) * torch.rand(count, len(lower), generator=generator, dtype=torch.float64)

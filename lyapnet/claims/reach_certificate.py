@@ -20,7 +20,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 
 PATHS, SUBSTEPS = 12, 10  # closed loops to draw, and Euler–Maruyama steps for each step of Δt
-MOST_HORIZONS = 20  # horizons after which a drawn closed loop ends
+MOST_HORIZONS = 20  # length of a drawn closed loop, in horizons, if it neither reaches the target nor leaves D
 
 
 class ReachCertificate(Certificate):

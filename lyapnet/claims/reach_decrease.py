@@ -17,7 +17,7 @@ from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import noise_derivative
 
-WITHIN = 1 - 1e-9  # of a target's half widths: points that are a little inside of it; boxes are rounded outward besides
+WITHIN = 1 - 1e-9  # size of the target in which the condition is not required, relative to the target, for rounding
 
 
 class ReachDecrease(DecreaseCondition):
@@ -31,9 +31,9 @@ class ReachDecrease(DecreaseCondition):
     Args:
         closed_loop: the system with its noise σ, and a control law that V defines.
         target: a box; c ≤ 0 is not required in its interior.
-        avoided: boxes that are not to be met, for the facts of the condition.
-        probability: that of reaching the target, from which `aim` sets ρ.
-        named: σ of the noise by states, where it is not that of the task, for the facts of the condition.
+        avoided: boxes that closed loops must not meet, for the facts of the condition.
+        probability: p, the probability of reaching the target, from which `aim` computes ρ.
+        named: σ of the noise by state, if it is not that of the task, for the facts of the condition.
     """
 
     proves = "reach"
@@ -60,11 +60,11 @@ class ReachDecrease(DecreaseCondition):
 
     @property
     def gap(self) -> float:
-        """ρ − max V on X₀, upward rounded: exp(−λ gap) ≤ 1 − p."""
+        """ρ − max V on X₀, rounded upwards, so that exp(−λ gap) ≤ 1 − p."""
         return just_above(-math.log(1 - self.probability) / self.risk)
 
     def aim(self, risk: float, rate: float, largest: float) -> None:
-        """Set λ and ε, and the ρ from which closed loops with V(x₀) ≤ largest rise with probability 1 − p at most."""
+        """Set λ and ε, and a ρ that V exceeds with a probability of at most 1 − p from V(x₀) ≤ largest."""
         for name, value, unit in (("risk", risk, "1/cost"), ("rate", rate, "cost per second")):
             if not 0 < value < math.inf:
                 raise UsageError(f"Expected {name} > 0, got {value}; give it in {unit}.")

@@ -1,4 +1,4 @@
-"""The condition of a region of attraction on V and the receding law u(0, x), to be proved on boxes."""
+"""The condition of a region of attraction of the receding law u(0, x), which a proof bounds on boxes."""
 
 import math
 from collections.abc import Sequence
@@ -23,13 +23,13 @@ from lyapnet.task.sets import Box
 
 
 class RecedingDecrease(DecreaseCondition):
-    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially.
+    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)): V falls exponentially, but in a hole V < c.
 
     With a disturbance V̇ is replaced by its largest value, V_xᵀ(f + g u(0, x)) + Σ_i w_i |∂V/∂x_i|.
 
     Args:
         parameters: names of the constants of the system, on which neither V nor u depends.
-        readings: how u(0, x) is read and held; None: it is read at every t.
+        readings: when u(0, x) is read and then held; None: it is read at every t.
     """
 
     proves, partial = "region", True
@@ -66,11 +66,15 @@ class RecedingDecrease(DecreaseCondition):
         budget: Budget,
         proposed: float | None = None,
     ) -> None:
-        """Exclude the hole {x ∈ B: V < c} from the condition, where c ≤ level is below V around it.
+        """Exclude the hole {x ∈ B: V < c} from the condition, with c ≤ level and V > c around the hole.
 
         Args:
+            around: the contraction on B.
             states: D, extended by the bounds of the constants.
             proposed: the only c to test; None to choose the largest.
+
+        Raises:
+            UsageError: the proposed c is not below V around the hole.
         """
         rim = minimum(self.V, *self._around_hole(append_constants(around.box, states), states, seen), budget)
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
@@ -79,15 +83,15 @@ class RecedingDecrease(DecreaseCondition):
         self.constraints = self._hole_of(around.box)
 
     def _around_hole(self, inner: Box, states: Box, seen: Sequence[int]) -> tuple[Corners, Corners]:
-        """Boxes of (0, x) on which V > c is needed: the boundary of B, of which `inner` is the box with constants."""
+        """Boxes of (0, x) on which V > c is required: the boundary of B; `inner` is B with the bounds of constants."""
         return faces(*over_time(inner, 0.0), [1 + i for i in seen])
 
     def _hole_of(self, box: Box) -> Constraints:
-        """h > 0 where V need not fall, for the hole in a box B."""
+        """Constraints h ≤ 0 that exclude the hole in a box B."""
         return OutsideTheHole(self.V, box, self.hole)
 
     def open_everywhere(self, level: float) -> None:
-        """Exclude {x ∈ D: V < c} from the condition, where disturbances or a held control may increase V."""
+        """Exclude {x ∈ D: V < c} with c = level from the condition; disturbances or a held u may increase V there."""
         self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
@@ -103,7 +107,10 @@ class RecedingDecrease(DecreaseCondition):
 
 
 class OutsideTheHole(Constraints):
-    """h(x) > 0 on the hole {x ∈ B: V(0, x) < c}, or {x ∈ D: V(0, x) < c} without B: there V need not fall."""
+    """h(x) > 0 on the hole {x ∈ B: V(0, x) < c}, or {x ∈ D: V(0, x) < c} without B, where V need not fall.
+
+    B is taken a little smaller, for rounding.
+    """
 
     names = ("outside the hole",)
 

@@ -42,12 +42,13 @@ from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
 PER_HORIZON = 0.01  # default of λT
-LEVEL_TOLERANCE = 0.1  # relative tolerance of a level that no V in D is above
+LEVEL_TOLERANCE = 0.1  # relative accuracy of an upper bound of V on D, used as a level that excludes nothing
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedRegion:
-    """Let V(x) = V(0, x), let u(0, x) be applied at every time t, and let F = f + g u(0, ·) and ρ ≥ c > 0. Then
+    """Let V(x) = V(0, x), let u(0, x) be applied at every time t, and let F = f + g u(0, ·) and ρ ≥ c > 0. It is proved
+    that
 
         V̇ = V_xᵀF(x) ≤ −λ max(V(x), c) < 0   at each x ∈ D with V(x) ≤ ρ, outside the hole {x ∈ B: V(x) < c},
 
@@ -71,19 +72,19 @@ class ProvedRegion:
     {x ∈ D: V(x) ≤ c} within ln(ρ/c)/λ, and stays there: practical stability, with c as the ultimate bound. Convergence
     to the goal or to an equilibrium is not claimed. {x ∈ D: V(x) ≤ c} lies in the box `extent`.
 
-    With readings, u(0, x) is not read at every t, and the inequality holds for the control of each reading at x̂ ∈ D
-    with V(x̂) ≤ ρ, as long as it may be in use (see Readings). Since a held control need not let V fall near the goal,
-    the hole and what follows are as with a disturbance, which may be 0.
+    With readings, u is held in between, and the inequality holds for the control of each reading at x̂ ∈ D with
+    V(x̂) ≤ ρ, at all times at which it may be in use (see Readings). Near the goal V need not fall under a held control,
+    so the hole and the conclusions are those with a disturbance, which may be 0.
 
-    With steps, all of this is about x_{k+1} = F(x_k), one step of the horizon's method with u(0, x_k) held, and nothing
-    about the time between the steps. At each x ∈ D with V(x) ≤ ρ
+    With steps, the claim is about x_{k+1} = F(x_k), one step of the horizon's method with u(0, x_k) held, and not about
+    the time between the steps. At each x ∈ D with V(x) ≤ ρ
 
         V(F(x)) ≤ (1 − λΔt) max(V(x), c)     and     F(x) ∈ D,
 
     V > ρ wherever some constraint has h_j ≥ 0, V > c on D without B, and F contracts on B. {V ≤ ρ} may touch the
     boundary of D. By induction V(x_k) ≤ max((1 − λΔt)^k V(x_0), c): no sequence of steps that starts in {x ∈ D: V ≤ ρ}
-    leaves it, and {x ∈ D: V ≤ c}, a closed set in B, is entered and not left. There all sequences converge to one fixed
-    point of F by Banach's theorem, at the rate 1 − κΔt.
+    leaves it, and each enters the closed set {x ∈ D: V ≤ c} ⊂ B and stays there. In this set all sequences converge to
+    one fixed point of F by Banach's theorem, at the rate 1 − κΔt.
 
     With plants, all of this holds for ẋ = F(x; p) with every constant p in a box P, where u and V depend on x alone.
     The region is the same for all p; each p has its own equilibrium, in the hole.
@@ -220,7 +221,7 @@ class ProvedRegion:
 
     @property
     def _cause(self) -> str:
-        """What a region could have less of."""
+        """The assumption that makes V rise, for advice to reduce it."""
         return "disturbance" if self.readings is None else "age and error of a reading"
 
     @property
@@ -377,11 +378,11 @@ def _open_hole(
     budget: Budget,
     kept: KeptRegion | None,
 ) -> tuple[Contraction | None, float, float]:
-    """Open the hole: where the law contracts, or as large as disturbances and readings require; or that of a file.
+    """Open the hole: on a set where the law contracts; as large as disturbances or readings require; or as in a file.
 
     Returns:
-        (the contraction, the largest real part of the linearised law's eigenvalues, the level up to which to prove).
-        With a disturbance or readings the first two are None and nan.
+        (the contraction, `slowest` as in contraction_around, the level up to which to prove). With a disturbance or
+        readings the first two are None and nan.
     """
     levels = budget_for_level(budget)
     if condition.disturbance is not None or condition.readings is not None:
@@ -398,7 +399,7 @@ def _open_hole(
         level = kept.level(contraction is not None, rim)
     elif rim < math.inf:
         level = just_below(rim)
-    else:  # a number that no V in D is above
+    else:  # any level is possible: take one that V does not exceed on D
         lower, upper = (side[None] for side in setting.domain)
         level = -minimum(
             lambda t, x: -condition.V(t, x), lower, upper, budget_for_level(budget), tolerance=LEVEL_TOLERANCE

@@ -31,13 +31,14 @@ from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.sets import Box
 from lyapnet.value.policy import ValuePolicy
 
-NEAR_BOUNDARY = 0.999  # of the least V on the boundary of D: a larger D is needed for a region with such a ρ to grow
-PATHS, PATH_MARGIN = 16, 0.03  # number of closed loops to draw; they begin where 1 − PATH_MARGIN < V/ρ ≤ 1
+NEAR_BOUNDARY = 0.999  # ρ relative to the least V on the boundary of D, above which only a larger D could help
+PATHS, PATH_MARGIN = 16, 0.03  # number of drawn closed loops; they begin where 1 − PATH_MARGIN < V/ρ ≤ 1
 
 
 class RegionCertificate(Certificate):
-    """A set that no closed loop of the receding law leaves and from which all converge to one equilibrium. With a
-    disturbance, or where u is held, all enter a smaller set around the goal, which none leaves.
+    """A set that no closed loop of the receding law leaves, and from which all converge to one equilibrium.
+
+    With a disturbance, or if u is held, all closed loops enter a smaller set around the goal, which none leaves.
     """
 
     kind: str = "region"
@@ -234,7 +235,7 @@ class RegionCertificate(Certificate):
 
     @property
     def _origin(self) -> str:
-        """Where V and u were made elsewhere, what they are."""
+        """A sentence on imported V and u; empty for trained ones."""
         policy = self.controller.closed_loop.policy
         return policy.origin if isinstance(policy, ValuePolicy) else ""
 

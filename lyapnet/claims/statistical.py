@@ -63,8 +63,8 @@ class BoundedShare(CountedSuccesses):
 
     The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
     holds for each event separately. Like the rollouts, the claim is about this model, this Δt and this integrator. If
-    one of K draws was chosen, the bounds hold only with confidence 1 − K(1 − confidence) (Bonferroni). The verdict
-    therefore uses bounds with confidence 1 − (1 − confidence)/K each, which together have the confidence.
+    one of K draws was chosen, the bounds together have only the confidence 1 − K(1 − confidence) (Bonferroni). The
+    verdict therefore uses bounds of confidence 1 − (1 − confidence)/K, which together have the given confidence.
     """
 
     confidence: float

@@ -1,4 +1,4 @@
-"""Conditions on V and the steps of the model, of claims in discrete time, to be proved on boxes."""
+"""The conditions of claims in discrete time, on V and the steps of the model, which a proof bounds on boxes."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -19,26 +19,27 @@ from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-NODE = 1e-9  # of Δt, by which the time of the last step may be off by rounding
-WITHIN = 1e-12  # by which F(x) has to lie in D, relative to its half widths, and ROUNDING, relative to its ends: more
-ROUNDING = 2**-50  # than middles and half widths are rounded by
+TIME_ROUNDING = 1e-9  # largest rounding error of the time of the last step, relative to Δt
+# F(x) must lie inside D by these distances, relative to D's half widths and to its ends, which are larger than the
+# rounding errors of D's middles and half widths
+WITHIN, ROUNDING = 1e-12, 2**-50
 
 
 class Stepped(DecreaseCondition):
     """A condition on the steps x⁺ = F(x, u) of a problem, which also requires F(x, u) ∈ D.
 
-    Its parts are (c, W, how far F(x, u) is outside of D).
+    Its parts are (c, W, a number that is ≤ 0 if F(x, u) ∈ D; see `outside`).
     """
 
     problem: Problem
-    sides: Sequence[tuple[int, float, float]]  # (axis, middle, half width, a little less) of D where it has bounds
+    sides: Sequence[tuple[int, float, float]]  # (axis, middle, half width rounded downwards) of D along bounded axes
 
     @property
     def facts(self) -> dict[str, Any]:
         return {**super().facts, "steps": steps_of(self.problem.horizon)}
 
     def keep_within(self, states: Box, axes: Sequence[int]) -> None:
-        """Require F(x, u) ∈ D along some axes: those with bounds, without constants."""
+        """Require F(x, u) ∈ D along some axes: all but constants and those without bounds."""
         self.sides = []
         for i in sorted(axes):
             low, high = float(states.lower[i]), float(states.upper[i])
@@ -50,12 +51,12 @@ class Stepped(DecreaseCondition):
         return x + self.problem.horizon.dt * self.problem.smooth_rates(x, u)[0]
 
     def outside(self, after: State) -> PerState:
-        """How far a state is outside of D, relative to D; at most 0 in D."""
+        """The largest distance of a state from D along an axis, relative to D's half width; at most 0 in D."""
         beyond = [(after[..., i] - middle).abs() / half - 1 for i, middle, half in self.sides]
         return reduce(torch.maximum, beyond) if beyond else torch.full_like(after[..., 0], -1.0)
 
     def values(self, points: Points) -> tuple[PerState, PerState]:
-        """(c, W) at points (t, x); c > 0 also where the next state lies outside of D; c is −∞ at excluded states."""
+        """(max(c, outside(F)), W) at points (t, x), with −∞ for the first at states that a constraint excludes."""
         t, x = points[:, 0], points[:, 1:]
         c, value, outside = self.parts(t, x)
         return torch.where(self.excluded(x), -torch.inf, torch.maximum(c, outside)), value
@@ -64,10 +65,10 @@ class Stepped(DecreaseCondition):
 class SteppedPayment(Stepped):
     """c = (V(t + Δt, F(x, u)) − V(t, x))/Δt + α max(ℓ̄, 0) − δ with u = policy(t, x) and ℓ̄ the mean of ℓ over the step.
 
-    Where c ≤ 0, W = V − δt falls by α times the cost of the step, or more. It is meant for 0 ≤ t ≤ T − Δt.
+    Where c ≤ 0, W = V − δt falls by at least α times the cost of the step, for 0 ≤ t ≤ T − Δt.
 
     Args:
-        problem: F and ℓ̄ are of one step of its horizon's method, with u held.
+        problem: F is one step of its horizon's method, with u held.
     """
 
     def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float, problem: Problem):
@@ -75,11 +76,14 @@ class SteppedPayment(Stepped):
         self.problem, self.sides = problem, []
 
     def domain_of(self, states: Box, left_out: Sequence[int]) -> tuple[Corner, Corner]:
-        """Require F(x, u) ∈ D, but for states left out and constants; [0, T − Δt] × D, or more by the rounding of T."""
+        """[0, T − Δt] × D, a little longer because T is rounded.
+
+        From now on, F(x, u) ∈ D is required along all axes but those of states left out and of constants.
+        """
         seen = [i for i in range(states.dimension) if i not in (*left_out, *self.closed_loop.system.constants)]
         self.keep_within(states, seen)
         horizon = self.problem.horizon
-        return over_time(states, horizon.duration - horizon.dt * (1 - NODE))
+        return over_time(states, horizon.duration - horizon.dt * (1 - TIME_ROUNDING))
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         return self.parts_under(t, x, self.closed_loop.policy(t, x))
@@ -93,9 +97,9 @@ class SteppedPayment(Stepped):
 
 
 class SteppedDecrease(Stepped, RecedingDecrease):
-    """(V(F(x)) − V(x))/Δt + λV(x) ≤ 0 and F(x) ∈ D, with V = V(0, ·) and u = u(0, x), but for steps into a hole.
+    """(V(F(x)) − V(x))/Δt + λV(x) ≤ 0 and F(x) ∈ D with V = V(0, ·), u = u(0, x), except for steps into a hole.
 
-    So V falls by the factor 1 − λΔt or more in each step, until the next one leads to V < (1 − λΔt)c.
+    So V falls at least by the factor 1 − λΔt in each step, until a step leads into the hole {V < (1 − λΔt)c}.
 
     Args:
         problem: F is one step of its horizon's method, with u(0, x) held.
@@ -110,11 +114,11 @@ class SteppedDecrease(Stepped, RecedingDecrease):
         self.problem, self.sides = problem, []
 
     def _around_hole(self, inner: Box, states: Box, seen: Sequence[int]) -> tuple[Corners, Corners]:
-        """Boxes that cover D without B: a step may jump over the boundary of B, so that V > c there is not enough."""
+        """Boxes that cover D without B; V > c on the boundary of B is not enough, since a step may jump over it."""
         return _outside(inner, states, seen)
 
     def _hole_of(self, box: Box) -> Constraints:
-        """h > 0 where the next step leads into the hole."""
+        """Constraints h ≤ 0 that exclude the states from which a step leads into the hole."""
         return IntoTheHole(self)
 
     def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
@@ -124,13 +128,13 @@ class SteppedDecrease(Stepped, RecedingDecrease):
 
 
 class IntoTheHole(Constraints):
-    """h(x) > 0 where the next step leads into the hole: V(F(x)) < (1 − λΔt)c and F(x) ∈ D."""
+    """h(x) > 0 if the next step leads into the hole: V(F(x)) < (1 − λΔt)c and F(x) ∈ D."""
 
     names = ("a step into the hole",)
 
     def __init__(self, condition: SteppedDecrease):
         super().__init__()
-        self.of = [condition]  # no module of its own: the condition has this one
+        self.of = [condition]  # in a list, since the condition contains this module and must not be a part of it
         self.level = just_below(condition.hole * (1 - condition.decay * condition.problem.horizon.dt))
 
     def forward(self, x: State) -> Tensor:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 
 def progress_reporter(stages: Callable[..., None], kind: str) -> Callable[[Any], None]:
-    """A callback for Progress that passes on the stage and the undecided share of [0, T] × D, D or X₀."""
+    """A callback that reports the stage of a Progress, and the undecided share of [0, T] × D, D or X₀."""
     domain = {"region": "D", "reach": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(
         kind, "[0, T] × D"
     )
@@ -32,7 +32,7 @@ def table_of(title: str, rows: Iterable[tuple[str, str]]) -> Table:
 
 def text_of(table: Table) -> str:
     """A table as text."""
-    plain = {"highlight": False, "markup": False, "force_jupyter": False, "color_system": None}  # in a notebook too
+    plain = {"highlight": False, "markup": False, "force_jupyter": False, "color_system": None}
     console = Console(file=io.StringIO(), width=100, **plain)
     with console.capture() as printed:
         console.print(table)

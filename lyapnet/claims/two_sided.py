@@ -18,7 +18,7 @@ class TwoSidedCertificate(Certificate):
         super().__init__(above.controller, above.claim, options)
         self.above, self.below, self.kind = above, below, above.kind
         self.picture = above.picture_of_both
-        above.options = options  # with the seconds of both proofs
+        above.options = options  # their seconds are those of both proofs
 
     @property
     def verdict(self) -> Verdict:

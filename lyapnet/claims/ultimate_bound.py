@@ -15,27 +15,25 @@ from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.taylor import TaylorForm, negate, shift
 from lyapnet.task.sets import Box
 
-SAMPLES, SCALES = 5_000, 10  # samples in each box, and number of boxes around the goal, each half as large
-MARGIN = (
-    0.01  # relative margin above the highest level at which V may rise, and around a hull, where bounds are too wide
-)
-HELD_MARGIN = 0.3  # the same where u is held: while a control is in use V may rise by so much
-BOXES = 30_000  # boxes for the highest level at which V may rise after a reading
-LEAST_SHARE = 0.003  # a smaller share of D between two levels may be due to chance
-PIECES = 16  # boxes into which the box of the constants is cut, about
-LEAST_LEVEL = 1e-6  # the smallest c, as a share of the middle level
+SAMPLES, SCALES = 5_000, 10  # number of samples in each box, and of boxes around the goal, each half as large
+MARGIN = 0.01  # relative margin above the highest level at which V may rise, and around a hull, as bounds are wide
+HELD_MARGIN = 0.3  # the former if u is held: V may rise by so much while a control is in use
+BOXES = 30_000  # largest number of boxes for the highest level at which V may rise while a control is held
+LEAST_SHARE = 0.003  # least share of D between two levels without samples at which V rises; less may be chance
+PIECES = 16  # number of boxes, about, into which the box of the constants is cut
+LEAST_LEVEL = 1e-6  # the smallest c, relative to the middle level
 
 
 def ultimate_level(
     condition: DecreaseCondition, domain: tuple[Corner, Corner], goal: State, level: float, budget: Budget
 ) -> float:
-    """An estimate of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ, with some room; 0 if none is found.
+    """An estimate, with a margin, of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ; 0 if none is found.
 
-    Samples give two levels between which the condition seems to hold. Below the middle of these, the highest V at which
-    the condition may fail is bounded from above, on pieces of the constants' box. The result is not a proof.
+    Samples give two levels between which the condition seems to hold. Below their mean, the highest V at which the
+    condition may fail is bounded from above, on pieces of the constants' box. The result needs a proof.
 
     Args:
-        condition: V̇ + λV, at V > 0; for all readings, where u is held.
+        condition: V̇ + λV, for V > 0.
         domain: {0} × D, extended by the box of the constants.
         level: the highest ρ.
     """
@@ -91,7 +89,7 @@ def _levels_of_fall(
     level: float,
     constants: Sequence[int],
 ) -> tuple[float, float] | None:
-    """The two levels with the most volume of D between them such that V falls at all samples there, or None."""
+    """The two levels with the largest volume of D between them such that V falls at all samples there, or None."""
     x, weight = _sample_around_goal(*domain, goal, constants)
     points = torch.cat([x.new_zeros(len(x), 1), x], -1)
     if condition.readings is not None:  # at the end of the use of each control
@@ -109,7 +107,7 @@ def _levels_of_fall(
 
 
 def _sample_around_goal(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """(x, weights): samples of D and of smaller boxes around the goal, where levels are close to each other."""
+    """(x, weights): samples of D and of smaller and smaller boxes around the goal, for levels near 0."""
     share = torch.rand(SAMPLES, len(goal), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     x = lower[1:] + (upper - lower)[1:] * share
     scales = 0.5 ** torch.arange(SCALES, dtype=torch.float64)
@@ -130,7 +128,7 @@ def extent_of(V: Value, states: Box, level: float, budget: Budget, t: float = 0.
 
 
 class HullBelow(Question):
-    """A box around {V ≤ level}: the hull of points with V ≤ level, slightly enlarged, and of all undecided boxes."""
+    """A box around {V ≤ level}: the slightly enlarged hull of points with V ≤ level, and all undecided boxes."""
 
     def __init__(self, V: Value, bounded: BoundedFunction, level: float):
         self.V, self.bounded, self.level = V, bounded, level

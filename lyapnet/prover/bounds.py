@@ -32,6 +32,7 @@ from lyapnet.prover import taylor
 from lyapnet.prover.bound_kernel.kernel import BoundKernel, kernel_of
 from lyapnet.prover.bound_kernel.program import Support, supports_of_boxes
 from lyapnet.prover.bound_rules import ARRANGEMENTS, BOOLEAN_OPERATORS, RULES
+from lyapnet.prover.boxes import random_points
 from lyapnet.prover.rounding import rounding
 from lyapnet.prover.simplification import with_known_truths, without_copies
 from lyapnet.prover.taylor import TaylorForm, box_form, wide_axes
@@ -84,11 +85,9 @@ class BoundedFunction(Bounds):
         degree: int = 2,
         exact: bool = False,
     ):
-        lower, upper = sample
         self.degree = degree
-        generator = torch.Generator().manual_seed(0)
-        share = torch.rand(TRACE_POINTS, len(lower), generator=generator, dtype=torch.float64).to(lower)
-        first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
+        points = random_points(*sample, TRACE_POINTS, torch.Generator().manual_seed(0))
+        first, *others = [(point[0].clone(), point[1:].clone()) for point in points]
         try:
             with rounding(counted=not exact), as_operators(MINIMA, not exact):
                 graph = trace(function, first, others)
@@ -105,7 +104,7 @@ class BoundedFunction(Bounds):
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
         self._seen: Counter[Hashable] = Counter()  # number of boxes so far, by the key of their kernel
         self._kernels: dict[Hashable, BoundKernel | None] = {}
-        self.forms(lower[None], upper[None])  # finds an operator without a rule
+        self.forms(*(side[None] for side in sample))  # finds an operator without a rule
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
         """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.

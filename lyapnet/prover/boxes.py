@@ -155,3 +155,8 @@ def faces(lower: Corner, upper: Corner, axes: Iterable[int]) -> tuple[Corners, C
             low.append(torch.where(at, side, lower))
             high.append(torch.where(at, side, upper))
     return torch.stack(low), torch.stack(high)
+
+
+def random_points(lower: Corner, upper: Corner, count: int, generator: torch.Generator | None = None) -> Corners:
+    """Points drawn uniformly from a box, (count, axes)."""
+    return lower + (upper - lower) * torch.rand(count, len(lower), generator=generator, dtype=torch.float64).to(lower)

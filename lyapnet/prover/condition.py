@@ -12,6 +12,7 @@ from lyapnet.base.types import Control, Corner, PerState, Points, State, Time
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.bounded_readings import BoundedReadings
 from lyapnet.prover.bounds import BoundedFunction, Bounds
+from lyapnet.prover.boxes import random_points
 from lyapnet.prover.readings import Readings, Run, simulate_runs
 from lyapnet.task.constraints import Constraints
 from lyapnet.value.calculus import (
@@ -283,8 +284,7 @@ def require_own_gradient(V: ValueFunction, domain: tuple[Corner, Corner], points
         declared = torch.stack([torch.hstack([V_t, V_x]), torch.hstack([V_t, V.value_and_state_gradient(t, x)[1]])])
         return declared - true, declared, true
 
-    (lower, upper), generator = domain, torch.Generator().manual_seed(0)
-    at = lower + (upper - lower) * torch.rand(points, len(lower), generator=generator, dtype=torch.float64)
+    at = random_points(*domain, points, torch.Generator().manual_seed(0))
     (low, high), (declared, _), (true, _) = BoundedFunction(difference, domain, degree=1).bounds(at, at)
     wrong = torch.nonzero((low > 0) | (high < 0)).tolist()
     if wrong:

@@ -9,6 +9,7 @@ from torch import Tensor
 from lyapnet.base.types import Corner, PerState, Points
 from lyapnet.prover.bounded_readings import BoundedReadings
 from lyapnet.prover.bounds import BoundedFunction, Bounds
+from lyapnet.prover.boxes import random_points
 from lyapnet.prover.condition import DecreaseCondition
 
 SAMPLES = 20_000  # random points of the domain
@@ -91,7 +92,7 @@ def _likely_violations(
     generator: torch.Generator | None,
 ) -> Points:
     """Samples of the box, and all points of gradient ascent from the samples with W ≤ level of greatest c."""
-    points = lower + (upper - lower) * torch.rand(SAMPLES, len(lower), generator=generator, dtype=torch.float64)
+    points = random_points(lower, upper, SAMPLES, generator)
     c, W = _values(condition, points)
     start = points[torch.where(level >= W, c, -torch.inf).topk(STARTS).indices]
     return torch.cat([points, _ascend(condition, start, lower, upper)])

@@ -26,7 +26,7 @@ class InHalves(Question):
 
     level = 0.3
 
-    def undecided(self, boxes):
+    def find_undecided(self, boxes):
         widths = boxes.upper - boxes.lower
         chosen = widths.amax(-1) > self.level
         boxes = boxes._replace(key=torch.full_like(boxes.key, float(os.getpid())))
@@ -41,12 +41,12 @@ def chunks():
 def test_workers_are_other_processes_that_see_the_level_as_it_is():
     question = InHalves()
     with workers_for_boxes(question, 2) as run:
-        (one, axes), (two, _), (none, _) = run(question.undecided, chunks())
+        (one, axes), (two, _), (none, _) = run(question.find_undecided, chunks())
         assert [len(boxes.key) for boxes in (one, two, none)] == [1, 2, 0]
         assert axes.tolist() == [0]
         assert float(one.key) != os.getpid()
         question.level = 2.0
-        assert [len(boxes.key) for boxes, _ in run(question.undecided, chunks())] == [0, 0, 0]
+        assert [len(boxes.key) for boxes, _ in run(question.find_undecided, chunks())] == [0, 0, 0]
     with workers_for_boxes(question, 1) as run:
         assert run is map
 
@@ -65,7 +65,7 @@ def test_a_violation_is_found_with_workers():
 
 def test_a_worker_that_is_killed_is_one_line():
     class Killed(InHalves):
-        def undecided(self, boxes):
+        def find_undecided(self, boxes):
             os.kill(os.getpid(), signal.SIGKILL)
 
     question, before = Killed(), threading.active_count()
@@ -73,7 +73,7 @@ def test_a_worker_that_is_killed_is_one_line():
         pytest.raises(UsageError, match="Expected all workers to finish, got one that was killed"),
         workers_for_boxes(question, 2) as run,
     ):
-        list(run(question.undecided, chunks()))
+        list(run(question.find_undecided, chunks()))
     assert threading.active_count() <= before + 2, "the threads of a pool ended with it"
 
 
@@ -88,7 +88,7 @@ def test_another_machine_bounds_the_same_or_nothing():
     boxes, rounds = root_box(*domain()), 0
     while len(boxes.key):
         rounds += 1
-        (here, axis), (other, same) = question.undecided(boxes), there.undecided(boxes)
+        (here, axis), (other, same) = question.find_undecided(boxes), there.find_undecided(boxes)
         assert torch.equal(here.lower, other.lower)
         assert torch.equal(axis, same)
         boxes = here.halves(axis) if len(axis) else here

@@ -1,4 +1,4 @@
-"""Moving coordinates along closed loops: how bounds change when the coordinates change or turn."""
+"""Moving coordinates along closed loops: bounds in other coordinates, and bounds of how far coordinates turn."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class Moving(NamedTuple):
 
     @property
     def size(self) -> Tensor:
-        """Σ of the parts' absolute values, at least |Φ|."""
+        """|middle| + |slope| + |bend|, an upper bound of |Φ(τ)|."""
         return self.middle.abs() + self.slope.abs() + self.bend.abs()
 
     def __getitem__(self, chosen: Tensor) -> "Moving":  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -40,8 +40,8 @@ def bound_in_new_frame(
     largest row sum of |YB − 1|. Rounding is added.
 
     Args:
-        before, after: A and B in floating point.
-        size, size_after: bounds of the numbers of which A and B are sums, for their rounding.
+        before, after: A and B, computed in floating point.
+        size, size_after: sums of the absolute values of A's and B's summands, for their rounding errors.
     """
     Y, n = near_inverse(after), r.shape[-1]
     into = (Y @ before).abs() + 4 * (n + 4) * EPSILON * (Y.abs() @ size)
@@ -50,7 +50,7 @@ def bound_in_new_frame(
 
 
 def bound_turn(frame: Moving) -> tuple[Tensor, Tensor]:
-    """(Y, E), (cells, n, n) each: Y ≈ Φ(0)⁻¹ in the middle of a step, and |YΦ(τ) − 1| ≤ E at every τ."""
+    """(Y, E), (cells, n, n) each: Y ≈ Φ(0)⁻¹ in the middle of a step, and |YΦ(τ) − 1| ≤ E for every τ of the step."""
     Y = near_inverse(frame.middle)
     n = Y.shape[-1]
     moved = (Y @ frame.slope).abs() + (Y @ frame.bend).abs() + 4 * (n + 4) * EPSILON * (Y.abs() @ frame.size)
@@ -60,7 +60,7 @@ def bound_turn(frame: Moving) -> tuple[Tensor, Tensor]:
 def near_inverse(A: Tensor) -> Tensor:
     """A⁻¹ up to rounding, (*batch, n, n); arbitrary numbers for a matrix that is singular or not finite.
 
-    Proofs hold for any numbers returned here: a cell with a singular matrix is just not proved.
+    Proofs hold for any result: cells with arbitrary numbers are not proved.
     """
     return torch.linalg.inv_ex(A).inverse
 

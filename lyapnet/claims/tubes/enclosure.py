@@ -15,11 +15,11 @@ from lyapnet.prover.taylor import EPSILON, TaylorForm, monomials
 SMALLEST_RADIUS = 1e-30  # the smallest r̂, for states that do not move
 TRIES = 6  # values of r̂ to test on a step
 LARGEST_CONDITION = 100.0  # coordinates with a larger condition number are made orthogonal
-LARGEST_TURN = 0.3  # largest change of the coordinates within a step, relative to them
-HARMLESS_GROWTH = 1e-3  # a growth of r of this size over T is accepted without shortening steps
+LARGEST_TURN = 0.3  # largest relative change of the coordinates within a step, unless the step is the shortest one
+HARMLESS_GROWTH = 1e-3  # growth of r over T that does not make steps shorter
 SHORTEST_STEP = 1 / 2000  # shortest step, as a share of T
-LARGEST_RADIUS = 0.5  # a cell is given up when r is larger, in units of the states
-BINS = 60  # equal parts of [0, T] for which ranges are stored
+LARGEST_RADIUS = 0.5  # largest Σ r, in units of the states; cells beyond it are given up
+BINS = 60  # number of equal parts of [0, T] for which ranges are stored
 
 
 class Cells(NamedTuple):
@@ -37,19 +37,19 @@ class Enclosed(NamedTuple):
 
     proved: Tensor  # bool
     violated: Tensor  # bool: whether every closed loop of the cell violates a constraint
-    cost: Tensor  # a polynomial near J(x₀), in the order of monomials(e, DEGREE), (terms, cells)
-    cost_slack: Tensor  # bounds of J minus this polynomial, (cells, 2)
+    cost: Tensor  # P, a polynomial near J(x₀), in the order of monomials(e, DEGREE), (terms, cells)
+    cost_slack: Tensor  # bounds of J − P, (cells, 2)
     ends: Tensor  # bounds of x(T), (cells, n, 2)
     ranges: Tensor  # bounds of x(t) on BINS parts of [0, T], (BINS, cells, n, 2)
     bend: Tensor  # the nonlinearity along each axis, (cells, e)
     steps: int
-    bounded: int  # Taylor forms that were computed
+    bounded: int  # number of computed Taylor forms
 
 
 class Step(NamedTuple):
     """The result of a step for some cells, (cells, …) each."""
 
-    radius: State  # a bound of |z| on the step, and r at its end
+    radius: State  # a bound of |z| on the step, which is r at its end
     rest: PerBox  # the largest remainder of the Taylor forms of Yv
     cost: Tensor  # bounds of the integral of ℓ minus its polynomial, (cells, 2)
     worst: Tensor  # bounds of max_j h_j over the step, (cells, 2); −∞ without constraints
@@ -149,9 +149,9 @@ class _Tube:
         self.steps = self.bounded = 0
 
     def step(self, h: float) -> float:
-        """Take a step of h seconds or less, and keep the cells for which it is proved; return the next h.
+        """Take a step of at most h seconds, and keep the cells for which it is proved; return the next h.
 
-        The step is so short that for most cells F is no more nonlinear in τ than in ε and z.
+        The step is halved until, for 90 % of the cells, F is no more nonlinear in τ than in ε and z together.
         """
         enclosure, front = self.enclosure, self.front
         kink = next(t for t in enclosure.kinks if t > front.t + 1e-7 * enclosure.duration)
@@ -201,10 +201,10 @@ class _Tube:
         self.front = front.select(held)
 
     def _frame(self, front: Front, p: Terms, end: float) -> tuple[Moving, Tensor]:
-        """Choose coordinates for a step; return them and the size of their change, in floating point.
+        """Choose coordinates for a step; return them, and their relative change over the step as an estimate.
 
-        They continue those of the previous step, scaled to unit length in the states' units; skewed ones are made
-        orthogonal.
+        They continue those of the previous step, with columns scaled to unit length in the units of the states; skewed
+        ones are made orthogonal.
         """
         unit, h = self.enclosure.unit, end - front.t
         if front.frame is None:
@@ -235,19 +235,19 @@ class _Tube:
         return ((plus - minus) / (2 * step.diagonal()[:, None, None, None])).movedim(0, -1)
 
     def _radius_at_start(self, front: Front, p: Terms, frame: Moving) -> tuple[Tensor, Tensor]:
-        """(r, the error of ∫ℓ) at the beginning of a step, in its coordinates; both include the rounding of p."""
+        """(r in the coordinates of the step, the error of ∫ℓ) at its beginning; both include the rounding of p."""
         begins = at_step_end(p, self.e, -1)
         size = at_step_end(p.abs(), self.e, 1) + front.end.abs()
         jump = ((begins - front.end).abs() + 16 * EPSILON * size).sum(0) * ROOM
         before = frame.at(-1) if front.frame is None else front.frame.at(1)
         size = frame.size if front.frame is None else front.frame.size
         r, jump, error = front.radius, jump[:, : self.n], jump[:, self.n]
-        if front.frame is None:  # the radius is still a bound of x itself
+        if front.frame is None:  # at t = 0 the radius is a bound of x − p itself
             r, jump = torch.zeros_like(r), jump + r
         return bound_in_new_frame(before, size, frame.at(-1), frame.size, jump, r), error
 
     def _bound_step(self, start: tuple[Tensor, Tensor], p: Terms, frame: Moving, t: float, end: float) -> Step:
-        """Bound a step, with increasing r̂ until it is proved or TRIES are used up."""
+        """Bound a step, with increasing r̂ until it is proved, at most TRIES times."""
         r, error = start
         h, count = end - t, len(r)
         Y, E = bound_turn(frame)
@@ -281,7 +281,7 @@ class _Tube:
     def _bound_defect(
         self, p: Terms, frame: Moving, Y: Tensor, hat: State, t: float, end: float
     ) -> tuple[Tensor, Tensor, Tensor, TaylorForm]:
-        """(a bound of |Yv|, bounds of ℓ − its polynomial, bounds of max_j h_j, Yv) on a step, if |z| ≤ r̂."""
+        """(a bound of |Yv|, bounds of ℓ minus its polynomial, bounds of max_j h_j, Yv) on a step, for all |z| ≤ r̂."""
         n, h, cells = self.n, end - t, p.shape[1]
         self.bounded += cells
         x, rate = self._moving_polynomials(p, frame, hat)
@@ -312,7 +312,7 @@ class _Tube:
         return x, rate
 
     def _bend_sizes(self, form: TaylorForm) -> Tensor:
-        """The size of the terms of degree three due to τ, each ε_k, and z, (cells, 2 + e), as a measure of bending."""
+        """The size of the terms of degree three in τ, each ε_k, and z, (cells, 2 + e), as a measure of nonlinearity."""
         bends = torch.zeros(form.radius.shape[0], 2 + self.e, dtype=torch.float64)
         for axes, k in self.place.items():
             if len(axes) == DEGREE:
@@ -323,7 +323,7 @@ class _Tube:
         return bends
 
     def _supports(self) -> list[tuple[int, ...]]:
-        """The possibly nonzero terms of (t, x, rate, Y): t is linear in τ, Y is constant, z multiplies powers of τ."""
+        """The terms of (t, x, rate, Y) that may be nonzero: t is linear in τ, Y constant, z multiplies powers of τ."""
         own = {self.place[axes] for axes in places(1 + self.e, DEGREE)}
         with_z = {self.place[axes] for axes in self.place if len(axes) and max(axes) > self.e and not any(axes[:-1])}
         moving = tuple(sorted(own | with_z))
@@ -354,7 +354,7 @@ class _Tube:
         )
 
     def _bound_end(self, front: Front) -> tuple[Tensor, Tensor, Tensor]:
-        """(a polynomial in ε near J, bounds of J minus it, bounds of x(T))."""
+        """(P, a polynomial in ε near J; bounds of J − P; bounds of x(T))."""
         n, alone = self.n, list(places(self.e, DEGREE))
         assert front.frame is not None
         at_T, size = front.frame.at(1), front.frame.size

@@ -1,4 +1,4 @@
-"""The closed loop of a tube, with bounds of the defect of polynomials in its differential equation."""
+"""The closed loop of a tube, and bounds of the defect of polynomials in its differential equation."""
 
 from collections.abc import Sequence
 
@@ -12,6 +12,7 @@ from lyapnet.claims.control_sets import check_controls
 from lyapnet.claims.preconditions import check_loop, check_parts
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.boxes import random_points
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.problem import TRIED
 
@@ -22,9 +23,9 @@ class Field:
     """F(t, x) = (f + g u, ℓ) with u = policy(t, x), in the states that are not ignorable.
 
     Args:
-        loop: in float64.
-        seen: the indices of these states; the others are 0.
-        domain: a box of (t, x) with all n states, on which functions are traced.
+        loop: the closed loop, in float64.
+        seen: the indices of these states; the others are set to 0.
+        domain: a box of (t, x) with all states, on which functions are traced.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Field:
         return torch.cat([slope[..., self.seen], slope[..., -1:]], -1)
 
     def kinks(self, duration: float, dt: float) -> list[float]:
-        """Times between 0 and T at which a curve in the law has a node; or Δt earlier, where a sampled law reads it."""
+        """Times in (0, T) at which a curve in the law has a node, and Δt earlier, when a sampled law reads the node."""
         nodes = {t for module in self.loop.modules() if isinstance(module, Curve) for t in module.nodes.tolist()}
         return sorted(t for t in {*nodes, *(t - dt for t in nodes)} if 0 < t < duration)
 
@@ -68,9 +69,8 @@ class Field:
 
 
 def _check(field: Field, lower: Corner, upper: Corner) -> None:
-    """Refuse a closed loop that is another function on batches than on one point, or that differs from its parts."""
-    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
-    points = lower + (upper - lower) * share
+    """Refuse a closed loop whose values on batches and at single points differ, or that differs from its parts."""
+    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
     t, x = points[:, 0], points[:, 1:]
     check_function("(f + g u, ℓ)", field.slope, [t, x], (field.n + 1,), differentiable=False, any_size=False)
     with torch.no_grad():

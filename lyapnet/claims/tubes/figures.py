@@ -13,7 +13,7 @@ from lyapnet.claims.costs import Inside
 from lyapnet.claims.tubes.tube import ProvedTube
 from lyapnet.controller.controller import Controller
 
-SHOWN = 12  # simulated closed loops in the figure
+SHOWN = 12  # number of simulated closed loops in the figure
 
 
 def tube(

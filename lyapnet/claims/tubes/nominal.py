@@ -55,10 +55,10 @@ def integrate(slope: Slope, t: float, h: float, y: Tensor) -> Tensor:
 
 
 def interpolate_step(before: Flow, after: Flow, h: float, e: int) -> Tensor:
-    """p(τ, ε) over h seconds, τ from −1 to 1, through what it is at both ends; (terms, cells, n + 1).
+    """The polynomial p(τ, ε), −1 ≤ τ ≤ 1, of a step of h seconds from its values and rates at both ends.
 
-    Coefficients of ε⁰, ε¹ and ε² are polynomials in τ of degree 3, 2 and 1, so that p is continuous from step to step,
-    but for rounding. The terms are in the order of `monomials(1 + e, DEGREE)`.
+    Coefficients of ε⁰, ε¹ and ε² are polynomials in τ of degree 3, 2 and 1, so p is continuous from step to step up to
+    rounding. The terms, (terms, cells, n + 1), are in the order of `monomials(1 + e, DEGREE)`.
     """
     place, known = places(1 + e, DEGREE), monomials(e, 2)
     terms = before.y.new_zeros(len(place), *before.y.shape[1:])
@@ -82,7 +82,7 @@ def derivative(terms: Terms, e: int) -> Tensor:
 
 
 def at_step_end(terms: Terms, e: int, tau: int) -> Tensor:
-    """p(τ, ε) at τ = ±1, with terms in the order of `monomials(e, DEGREE)`; each is a sum of at most four."""
+    """p(τ, ε) at τ = ±1, with terms in the order of `monomials(e, DEGREE)`; each is a sum of up to four."""
     place = places(e, DEGREE)
     found = terms.new_zeros(len(place), *terms.shape[1:])
     for axes, k in places(1 + e, DEGREE).items():

@@ -25,10 +25,10 @@ from lyapnet.prover.workers import workers_for_calls
 from lyapnet.task.constraints import names_of
 from lyapnet.task.sets import Box
 
-CELLS = 128  # cells into which X₀ is cut first, about
-AT_ONCE = 128  # cells in a chunk; their tubes take the same steps
-SIMULATED = 256  # simulated closed loops that give the unit of each state
-SMALLEST = 1e-9  # a cell with a smaller share of X₀ is not cut further
+CELLS = 128  # largest number of cells into which X₀ is cut at first
+AT_ONCE = 128  # number of cells of a chunk, whose tubes take the same steps
+SIMULATED = 256  # number of simulated closed loops; the largest |x_i| on them is the unit of state i
+SMALLEST = 1e-9  # share of X₀ below which cells are not cut further
 NOTHING_KEPT = "Stopped while certifying: the proof of a tube cannot be kept."
 
 
@@ -52,8 +52,8 @@ class ProvedTube:
     cost: Tensor  # P, in the order of monomials(axes, DEGREE)
     slack: Tensor  # (cells, 2)
     ends: Tensor  # (cells, seen, 2)
-    ranges: Tensor  # of all cells, (BINS, seen, 2)
-    volume_share: float  # of X₀ in the cells
+    ranges: Tensor  # for all cells together, (BINS, seen, 2)
+    volume_share: float  # share of X₀ in the cells
     violating: list[float] | None  # the middle of a cell all of whose closed loops violate a constraint
     boxes: int  # tested cells
     steps: int  # summed over the tested cells
@@ -121,7 +121,7 @@ class ProvedTube:
 
 
 class _TubeResults:
-    """The results of all cells so far."""
+    """The results for all cells so far."""
 
     def __init__(self, n: int):
         self.parts: list[tuple[Tensor, ...]] = []
@@ -200,8 +200,10 @@ def _enclosure_of(controller: Controller, loop: Any, seen: list[int]) -> Enclosu
 
 
 def _choose_cells(waiting: Boxes, sizes: Tensor, count: int) -> tuple[Boxes, Boxes]:
-    """(the next cells, the others). Half of the next cells are the smallest, which are likely to be proved; half are
-    the largest, so that cells that cannot be proved do not take all of the time.
+    """(the next cells, the others).
+
+    Half of the next cells are the smallest, which are likely to be proved; half are the largest, so that small cells
+    that cannot be proved do not take all of the time.
     """
     order = sizes.argsort(stable=True)
     half = min(count, len(order)) // 2
@@ -215,7 +217,7 @@ def _seeded() -> torch.Generator:
 
 
 def _halve_repeatedly(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
-    """Halve boxes along each of their axes in turn, up to at most `count` boxes."""
+    """Halve boxes across each of the axes in turn, as long as there are at most `count` boxes."""
     turn = 0
     while axes and 2 * len(boxes.key) <= count:
         boxes = boxes.halves(torch.full((len(boxes.key),), axes[turn % len(axes)]))
@@ -224,7 +226,7 @@ def _halve_repeatedly(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
 
 
 def _choose_axes(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: State) -> Tensor:
-    """The axis along which to cut each box: the one of the largest bend among those that are not too narrow."""
+    """The axis across which to cut each box: that of the largest bend, among those that are not too narrow."""
     widths = ((boxes.upper - boxes.lower) / (upper - lower).where(upper > lower, 1.0))[:, list(axes)]
     score = torch.where(widths >= widths.amax(-1, keepdim=True) / 64, bend + 1e-12 * widths, -1.0)
     return torch.tensor(list(axes))[score.argmax(-1)]

@@ -244,7 +244,7 @@ def short_ascents():
 def few_seconds_for_levels():
     """What is sought beside a proof takes no longer than this; for tests where it decides no verdict."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(funnel, "LEVELS", 0.5)
+        patch.setattr(funnel, "MAX_LEVEL_SECONDS", 0.5)
         yield
 
 

@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
-HALF, THIRD = 1 / 2, 1 / 3  # shares of the digits of a floating-point type
+HALF, THIRD = 1 / 2, 1 / 3  # shares of the digits of a number type in which two results must agree
 
 
 def are_close(found: Tensor, expected: Tensor, digits: float = HALF) -> bool:
     """Whether two results agree up to a share of their digits, relative to each entry or to the largest finite one.
 
-    The results may differ by rounding, since sums may be taken in another order. A nan must be nan in both.
+    So they may differ by the rounding of sums in another order. Both must have nan at the same entries.
     """
     if found.shape != expected.shape or found.dtype != expected.dtype:
         return False

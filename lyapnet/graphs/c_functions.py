@@ -1,8 +1,8 @@
 """Translates traced functions of tensors to C99: each operation becomes a loop over arrays.
 
 torch computes operations on constants, and their results become tables. Views, such as a transposition or a slice,
-need no code: an array is a place in memory with strides. All other operations become loops, whose inner line RULES
-gives; identical loops are written once, and then arranged (c_loops). Memory is allocated only on the stack.
+need no code, as an Array has strides. All other operations become loops around a line from RULES; identical loops are
+written once. At the end the loops are arranged (c_loops). Memory is allocated only on the stack.
 """
 
 import copy
@@ -15,22 +15,22 @@ from torch.fx import GraphModule, Interpreter, Node
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lyapnet.base.errors import ExportError, one_line
-from lyapnet.graphs.c_loops import arranged
+from lyapnet.graphs.c_loops import arrange_statements
 from lyapnet.graphs.c_rules import RULES
 from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of
 
 aten = torch.ops.aten
-STACK = 1_000_000  # largest size of the arrays of one function in bytes, in double precision: stacks have megabytes
+STACK = 1_000_000  # largest size of the arrays of one function, in bytes; stacks often have a few megabytes
 
 
 def c_function(
     signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
 ) -> tuple[str, int]:
-    """The text of a C function for a trace, and how many numbers its arrays on the stack hold.
+    """(the text of a C function for a trace, the number of entries of its arrays on the stack).
 
     Args:
-        signature: of the function, such as `void f(const double *x, double *y)`.
+        signature: the head of the function, such as `void f(const double *x, double *y)`.
         graph: a trace by `core_trace`, for one state.
         arguments: name of each array argument ↦ a tensor of its shape.
         results: the names of the arrays for the results.
@@ -41,7 +41,7 @@ def c_function(
     """
     text = Text(tables)
     write_body(text, graph, arguments, results)
-    lines, size = arranged(text.statements, text.arrays)
+    lines, size = arrange_statements(text.statements, text.arrays)
     if 8 * size > STACK:
         raise ExportError(
             f"Expected a law whose arrays fit on a stack, got {8 * size / 1e6:.3g} MB; export it to torch or onnx."
@@ -64,7 +64,7 @@ def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], res
 
 
 def without_shape_sources(graph: GraphModule) -> GraphModule:
-    """The trace without operations of which only the shape is used, such as x.sin() in torch.zeros_like(x.sin())."""
+    """The trace without operations whose result is used for its shape only, as x.sin() in torch.zeros_like(x.sin())."""
     nodes = copy.deepcopy(graph.graph)
     for node in list(nodes.nodes):
         if node.op == "call_function" and name_of(node.target) in SHAPED:
@@ -78,7 +78,7 @@ def without_shape_sources(graph: GraphModule) -> GraphModule:
 
 
 def helpers(code: str) -> list[str]:
-    """The text of the helper functions that some code calls."""
+    """The text of each helper function that the code calls."""
     return [text for call, text in HELPERS.items() if call in code]
 
 
@@ -189,7 +189,7 @@ class _Translator(Interpreter):
                 f"Expected operations that can be written in {self.text.language}, got {target}; write f, g, the cost "
                 f"or V in others, add it to the table of operators (docs/operators.md), or {self.text.otherwise}."
             ) from error
-        except Exception as error:  # a rule may raise anything for shapes that it does not expect
+        except Exception as error:  # rules may raise anything for shapes that they do not expect
             raise ExportError(
                 f"Expected operations that can be written in {self.text.language}, got {target}, and "
                 f"{type(error).__name__}: {one_line(error)[:200]}; {self.text.otherwise}."

@@ -1,4 +1,4 @@
-"""Statements of C in loops: loops that can be one are joined, and arrays share memory once their last read is past."""
+"""Statements of C in loops: joins loops, and lets arrays share memory after the last read."""
 
 import re
 from collections import defaultdict
@@ -20,7 +20,7 @@ class Statement:
 
     @cached_property
     def entries(self) -> dict[str, set[str | None]]:
-        """Array ↦ the indices of its entries that the line has; None where it has the array itself."""
+        """Array ↦ the indices of its entries in the line; None if the line names the array itself."""
         found = defaultdict[str, set[str | None]](set)
         for name in ARRAY.finditer(self.line):
             found[name[0]].add(_index_at(self.line, name.end()))
@@ -28,7 +28,7 @@ class Statement:
 
     @cached_property
     def _assignment(self) -> re.Match[str] | None:
-        """The array, the index and the sign of an assignment, if the line is one and does nothing else."""
+        """The match of ASSIGNMENT, (array, index, sign), if the line is an assignment and nothing else."""
         return None if any(None in indices for indices in self.entries.values()) else ASSIGNMENT.fullmatch(self.line)
 
     @property
@@ -37,26 +37,26 @@ class Statement:
         return None if self._assignment is None else self._assignment[1]
 
     @property
-    def begins(self) -> bool:
-        """Whether it is an assignment that does not read the array that it assigns to."""
+    def is_first_assignment(self) -> bool:
+        """Whether the line is an assignment by = that does not read the array to which it assigns."""
         found = self._assignment
         return found is not None and found[3] == "=" and self.line.count(f"{found[1]}[") == 1
 
     @cached_property
-    def visits_once(self) -> bool:
-        """Whether it assigns to another entry in each pass of its loops."""
+    def writes_each_entry_once(self) -> bool:
+        """Whether each pass of the loops assigns to another entry."""
         found = self._assignment
         return found is not None and all(re.search(rf"\bi{k}\b", found[2]) for k in range(len(self.sizes)))
 
     @property
     def written(self) -> Iterable[str]:
-        """The arrays that it may write to; results of the function, which have other names, are only written."""
+        """The arrays v0, v1, … to which the line may write; arrays of results have other names."""
         name = self.assigned
         return self.entries if name is None else [name] if name in self.entries else []
 
 
 def _index_at(line: str, start: int) -> str | None:
-    """What is in the brackets that begin there; None if none do."""
+    """The text in the brackets that begin at a position; None if there are none."""
     if line[start : start + 1] != "[":
         return None
     depth = 0
@@ -81,12 +81,12 @@ class Group:
         for name, indices in statement.entries.items():
             self.entries[name] |= indices
         for name in statement.written:
-            self.written[name] = self.written.get(name, True) and statement.visits_once
+            self.written[name] = self.written.get(name, True) and statement.writes_each_entry_once
 
-    def takes(self, statement: Statement) -> bool:
-        """Whether a statement can be the last one in these loops, with the results of loops of its own.
+    def can_take(self, statement: Statement) -> bool:
+        """Whether a statement may be appended to these loops instead of having its own, with the same results.
 
-        What one pass writes, no other pass may read or write.
+        Entries that one pass writes must not be read or written by other passes.
         """
         if statement.sizes != self.sizes or statement.assigned is None:
             return False
@@ -94,7 +94,7 @@ class Group:
             return True
         if any(each.assigned is None for each in self.statements):
             return False
-        writes = dict.fromkeys(statement.written, statement.visits_once)
+        writes = dict.fromkeys(statement.written, statement.writes_each_entry_once)
         for name, indices in statement.entries.items():
             if name not in self.entries or not (name in self.written or name in writes):
                 continue
@@ -103,32 +103,32 @@ class Group:
                 return False
         return True
 
-    def exchanges(self, statement: Statement) -> bool:
-        """Whether the order of this group and a statement matters."""
+    def conflicts_with(self, statement: Statement) -> bool:
+        """Whether results depend on the order of this group and a statement."""
         return any(name in self.written for name in statement.entries) or any(
             name in self.entries for name in statement.written
         )
 
     def feeds(self, statement: Statement) -> bool:
-        """Whether a statement reads what this group writes."""
+        """Whether a statement reads an array that this group writes."""
         return any(name in self.written for name in statement.entries)
 
 
-def arranged(statements: Sequence[Statement], arrays: Mapping[str, int]) -> tuple[list[str], int]:
-    """The lines of a function's body, and how many numbers its arrays m0, m1, … hold.
+def arrange_statements(statements: Sequence[Statement], arrays: Mapping[str, int]) -> tuple[list[str], int]:
+    """(the lines of a function's body, the number of entries of its arrays m0, m1, … in all).
 
-    What nobody reads is left out. Loops over the same sizes are joined. An array that is read only in the loop that
-    writes it becomes a number. All others have a place in one of m0, m1, …, which the next one gets when the last read
-    is past. These are several, and not parts of one, because compilers then know that they do not overlap.
+    Arrays that nothing reads are left out. Loops over the same sizes are joined. An array that is read only in the loop
+    that writes it becomes a number. All other arrays share the memory m0, m1, …: after its last read, an array's memory
+    is used by another one. The parts are separate arrays so that compilers know that they do not overlap.
 
     Args:
-        statements: in their order.
+        statements: the statements in their order.
         arrays: name ↦ number of entries.
     """
-    groups = _joined(_needed(statements))
-    numbers = _numbers(groups, arrays)
-    lives = _lives(groups, numbers)
-    memory, places = _places({name: arrays[name] for name in lives}, lives, groups)
+    groups = _join_loops(_remove_unread(statements))
+    numbers = _find_numbers(groups, arrays)
+    lives = _find_lives(groups, numbers)
+    memory, places = _assign_memory({name: arrays[name] for name in lives}, lives, groups)
     lines = [f"double {', '.join(f'm{k}[{size}]' for k, size in enumerate(memory))};"] if memory else []
     declared = set[str]()
     for group in groups:
@@ -136,17 +136,17 @@ def arranged(statements: Sequence[Statement], arrays: Mapping[str, int]) -> tupl
             if name in places and name not in declared:
                 declared.add(name)
                 lines.append(f"double *const {name} = m{places[name]};  /* {arrays[name]} */")
-        lines += _lines(group, numbers, declared)
+        lines += _write_group(group, numbers, declared)
     return lines, sum(memory)
 
 
 def loop_heads(sizes: Sequence[int], counter: str = "int") -> list[str]:
-    """The lines that begin loops over sizes."""
+    """The first lines of nested loops over sizes."""
     return [f"{'    ' * k}for ({counter} i{k} = 0; i{k} < {size}; i{k}++)" for k, size in enumerate(sizes)]
 
 
-def _needed(statements: Sequence[Statement]) -> list[Statement]:
-    """Without assignments to arrays that nothing reads later."""
+def _remove_unread(statements: Sequence[Statement]) -> list[Statement]:
+    """The statements without assignments to arrays that no later statement reads."""
     kept, read = list[Statement](), set[str]()
     for statement in reversed(statements):
         if statement.assigned not in statement.entries or statement.assigned in read:
@@ -155,19 +155,20 @@ def _needed(statements: Sequence[Statement]) -> list[Statement]:
     return kept[::-1]
 
 
-def _joined(statements: Sequence[Statement]) -> list[Group]:
-    """Statements in groups, each in the last one that takes it and whose results it reads.
+def _join_loops(statements: Sequence[Statement]) -> list[Group]:
+    """Groups of statements; each statement joins the last group that can take it and whose results it reads.
 
-    Others, such as first values of sums, stay on their own: in an earlier loop they would need memory for longer.
+    Other statements, such as first values of sums, have their own group: in an earlier one they would occupy memory for
+    longer.
     """
     groups = list[Group]()
     for statement in statements:
         for k in reversed(range(len(groups))):
             near = k == len(groups) - 1 and not statement.sizes
-            if groups[k].takes(statement) and (near or groups[k].feeds(statement)):
+            if groups[k].can_take(statement) and (near or groups[k].feeds(statement)):
                 groups[k].add(statement)
                 break
-            if groups[k].exchanges(statement):
+            if groups[k].conflicts_with(statement):
                 groups.append(Group(statement.sizes))
                 groups[-1].add(statement)
                 break
@@ -177,8 +178,8 @@ def _joined(statements: Sequence[Statement]) -> list[Group]:
     return groups
 
 
-def _numbers(groups: Sequence[Group], arrays: Mapping[str, int]) -> set[str]:
-    """The arrays that can be one number: of one entry, or of one that counts in a pass of one loop."""
+def _find_numbers(groups: Sequence[Group], arrays: Mapping[str, int]) -> set[str]:
+    """The arrays that can be a number: with one entry, or with one that matters in each pass of a single loop."""
     found = dict[str, list[tuple[int, Statement]]]()
     for k, group in enumerate(groups):
         for statement in group.statements:
@@ -189,15 +190,15 @@ def _numbers(groups: Sequence[Group], arrays: Mapping[str, int]) -> set[str]:
 
 def _is_number(name: str, at: Sequence[tuple[int, Statement]], size: int) -> bool:
     (_, first), indices = at[0], {index for _, statement in at for index in statement.entries[name]}
-    if len(indices) > 1 or None in indices or not first.begins or first.assigned != name:
+    if len(indices) > 1 or None in indices or not first.is_first_assignment or first.assigned != name:
         return False
     if any(statement.assigned is None for _, statement in at):
         return False
-    return (size == 1 and not first.sizes) or (first.visits_once and len({k for k, _ in at}) == 1)
+    return (size == 1 and not first.sizes) or (first.writes_each_entry_once and len({k for k, _ in at}) == 1)
 
 
-def _lives(groups: Sequence[Group], numbers: set[str]) -> dict[str, tuple[int, int]]:
-    """Array ↦ the first and the last group that has it."""
+def _find_lives(groups: Sequence[Group], numbers: set[str]) -> dict[str, tuple[int, int]]:
+    """Array ↦ the first and the last group that uses it, for arrays that are no numbers."""
     lives = dict[str, tuple[int, int]]()
     for k, group in enumerate(groups):
         for name in group.entries:
@@ -206,17 +207,17 @@ def _lives(groups: Sequence[Group], numbers: set[str]) -> dict[str, tuple[int, i
     return lives
 
 
-def _places(
+def _assign_memory(
     sizes: Mapping[str, int], lives: Mapping[str, tuple[int, int]], groups: Sequence[Group]
 ) -> tuple[list[int], dict[str, int]]:
-    """The sizes of the memory's parts, and array ↦ its part: the first that is free as long as it lives.
+    """(the sizes of the parts of the memory, array ↦ its part): the first part that is free while the array is used.
 
-    The largest array chooses first, so that no part grows later.
+    The largest arrays choose first, so that no part has to grow.
     """
 
     def is_past(old: str, new: str) -> bool:
         end, begin = lives[old][1], lives[new][0]
-        return end < begin or (end == begin and _follows(groups[begin], old, new))
+        return end < begin or (end == begin and _can_replace(groups[begin], old, new))
 
     memory, tenants, places = list[int](), list[list[str]](), dict[str, int]()
     for name in sorted(sizes, key=lambda name: (-sizes[name], lives[name])):
@@ -232,21 +233,21 @@ def _places(
     return memory, places
 
 
-def _follows(group: Group, old: str, new: str) -> bool:
-    """Whether a new array may take the place of an old one that is read for the last time in the same loops.
+def _can_replace(group: Group, old: str, new: str) -> bool:
+    """Whether a new array may use the memory of an old one that is read for the last time in the same loops.
 
-    Each pass then has to read its own entry of the old one alone, and before it writes the new one there.
+    This needs passes that read only their own entry of the old array, and before they write the new one there.
     """
     indices = group.entries[old] | group.entries[new]
     if not group.sizes or len(indices) > 1 or any(each.assigned is None for each in group.statements):
         return False
     last = max(k for k, each in enumerate(group.statements) if old in each.entries)
     first = min(k for k, each in enumerate(group.statements) if new in each.entries)
-    return last <= first and group.statements[first].assigned == new and group.statements[first].visits_once
+    return last <= first and group.statements[first].assigned == new and group.statements[first].writes_each_entry_once
 
 
-def _lines(group: Group, numbers: set[str], declared: set[str]) -> list[str]:
-    """The text of a group; numbers are declared where they are first assigned to."""
+def _write_group(group: Group, numbers: set[str], declared: set[str]) -> list[str]:
+    """The lines of a group; numbers are declared by their first assignment."""
     body = list[str]()
     for statement in group.statements:
         name, line = statement.assigned, statement.line

@@ -83,8 +83,8 @@ def _norm(text: Text, x: Array, ord: float = 2, dim: Any = None, keepdim: bool =
 def _product(text: Text, A: Any, B: Any) -> Array:
     """AB for matrices, vectors or batches of matrices.
 
-    The innermost loop is along rows of B, which are contiguous; where rows of A and columns of B are contiguous
-    instead, as in W'x with a table of W, it is a sum of their products.
+    The innermost loop is along rows of B, which are contiguous. If rows of A and columns of B are contiguous instead,
+    as in W'x with a table of W, long products are sums by a helper function.
     """
     a, b = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
     shape = (torch.empty(a.shape, device="meta") @ torch.empty(b.shape, device="meta")).shape
@@ -111,17 +111,17 @@ def _product(text: Text, A: Any, B: Any) -> Array:
     return Array(result.name, result.layout.reshape(shape))
 
 
-LONG = 8  # terms from which a sum of products is a call
+LONG = 8  # least number of summands for which a sum of products is a call of a helper function
 
 
 def _sums(text: Text, k: int, n: int, step: int, a: Array, b: Array, into: Array, whole: Array, shape: Any) -> Array:
-    """A product by calls: each is k sums of n products of the entries from a on, and of those from b + i step on."""
+    """A product by calls of the helper: each is k sums of n products of entries from a on, and from b + i · step on."""
     text.each(into.shape, [a, b], f"{text.rows}({k}, {n}, {step}, &{{0}}, &{{1}}, &{{into}});", into)
     return Array(whole.name, whole.layout.reshape(shape))
 
 
 def _identity(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **options: Any) -> Any:
-    """The value itself, since arrays are never written twice. Integers are stored as double too."""
+    """The value itself instead of a copy, since arrays are never written twice; integers are stored as double too."""
     if dtype is not None and not dtype.is_floating_point:
         raise NotImplementedError
     return x
@@ -162,7 +162,7 @@ def _copy(text: Text, x: Any, source: Any, *_: Any) -> Array:
 
 
 def _rearrangement(target: Any) -> Callable[..., Array]:
-    """An operation that moves entries by constant indices; torch applies it to the positions of the entries."""
+    """The rule of an operation that moves entries by constant indices: torch applies it to the positions of entries."""
 
     def rule(text: Text, x: Any, *args: Any, **kwargs: Any) -> Array:
         if any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
@@ -217,7 +217,7 @@ def _gather(text: Text, x: Any, dim: int, index: Any, *, sparse_grad: bool = Fal
 
 
 def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
-    """A copy with other entries at computed indices along an axis."""
+    """A copy of x in which entries at computed indices along an axis are replaced."""
     whole = text.copy(x, text.new(shape_of(x)))
     if not isinstance(index, Array):
         raise NotImplementedError
@@ -229,7 +229,7 @@ def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
 
 
 def _index_put(text: Text, x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> Array:
-    """A copy in which entries at constant indices along one axis are replaced, or others are added to them."""
+    """A copy of x in which entries at constant indices along one axis are replaced, or increased (accumulate)."""
     whole = text.copy(x, text.new(shape_of(x)))
     (axis, places), *more = [(axis, index) for axis, index in enumerate(indices) if index is not None]
     if more or not isinstance(places, torch.Tensor) or places.ndim != 1 or places.dtype == torch.bool:

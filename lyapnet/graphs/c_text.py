@@ -13,12 +13,12 @@ from torch.utils._pytree import tree_map
 
 from lyapnet.graphs.c_loops import Statement
 
-PER_LINE = 8  # numbers of a table in one line
+PER_LINE = 8  # entries of a table in a line
 
 
 @dataclass(frozen=True)
 class Array:
-    """A place in memory: the name of an array, and a meta tensor for its shape, strides and offset."""
+    """A view of an array in C: its name, and a meta tensor with the shape, strides and offset of the view."""
 
     name: str
     layout: Tensor
@@ -39,7 +39,7 @@ class Place(NamedTuple):
 
 
 class Tables:
-    """The constants of functions; equal constants share one table, and so do a matrix and its transpose."""
+    """The constants of functions as tables; equal constants share one, and so do a matrix and its transpose."""
 
     shares_transposes = True
 
@@ -120,13 +120,11 @@ class Text:
         )
 
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
-        """Write loops over a shape around a line, in which {0}, {1}, … are entries of the values, {into} the result.
-
-        An entry of an array is a Place.
+        """Write loops over a shape around a line with {0}, {1}, … for entries of the values and {into} for the result.
 
         Args:
-            values: Arrays, tensors or numbers; they are broadcast.
-            into: has that shape, possibly with strides of 0.
+            values: Arrays, tensors or numbers; they are broadcast. Entries of arrays are Places.
+            into: the array of the result; it has this shape, possibly with strides of 0.
         """
         arrays = [value if isinstance(value, Array) else self._constant(value) for value in (*values, into)]
         layouts = [array.layout.expand(tuple(shape)) if isinstance(array, Array) else None for array in arrays]
@@ -195,7 +193,7 @@ IN_DOUBLE = re.compile(
 
 
 def in_single_precision(code: str) -> str:
-    """C code in single precision: float, sinf and 0.1f in the place of double, sin and 0.1."""
+    """C code in single precision: float, sinf and 0.1f instead of double, sin and 0.1."""
     return IN_DOUBLE.sub(lambda word: _single(word[0]), code)
 
 
@@ -212,7 +210,7 @@ def _bytes_of(numbers: Tensor) -> bytes:
 
 
 def _axes(shape: Sequence[int], layouts: Sequence[Tensor]) -> list[tuple[int, tuple[int, ...]]]:
-    """The axes to loop over: (size, a stride for each array); axes that are contiguous in all arrays are merged."""
+    """The axes to loop over, as (size, a stride for each array); axes that are contiguous in all arrays are merged."""
     axes = list[tuple[int, tuple[int, ...]]]()
     for size, strides in zip(shape, zip(*(layout.stride() for layout in layouts), strict=True), strict=True):
         if size == 1:

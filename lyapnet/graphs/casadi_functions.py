@@ -1,7 +1,7 @@
 """Translates traced functions of tensors to CasADi expressions, operation by operation.
 
-torch computes operations on constants. Operations that only move entries are applied by torch to the indices of the
-entries, so that views, slices, concatenations and indexing need no rules. RULES has the arithmetic.
+torch computes operations on constants. Operations that only move entries need no rules, as torch applies them to the
+indices of the entries: views, slices, concatenations, indexing. RULES has the arithmetic.
 """
 
 import functools
@@ -22,7 +22,7 @@ from lyapnet.graphs.tracing import SHAPED, Tensors, core_trace, is_view, name_of
 Symbols = np.ndarray  # dtype object: its entries are scalar casadi.SX
 
 
-def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
+def trace_for_casadi(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
     """The trace of a function in torch's core operators.
 
     Raises:
@@ -31,11 +31,11 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
     return core_trace(function, arguments, "dynamics and cost", OracleError)
 
 
-def symbolic(graph: GraphModule, arguments: Sequence[Tensor]) -> casadi.Function:
+def casadi_function(graph: GraphModule, arguments: Sequence[Tensor]) -> casadi.Function:
     """A CasADi function for a trace; each argument and each result is a column vector.
 
     Args:
-        graph: a trace by `traced`.
+        graph: a trace by `trace_for_casadi`.
         arguments: tensors of the shapes for which it was traced.
 
     Raises:

@@ -31,7 +31,7 @@ def record(run: Callable[[], None]) -> Replay:
 class RecordedFunction:
     """(*arguments) ↦ results, by replaying the kernels that a function launched when it was recorded.
 
-    It is faster where launching thousands of small kernels one by one takes longer than running them.
+    This is faster for thousands of small kernels, as launching them one by one takes longer than running them.
 
     Args:
         function: of tensors; it launches the same kernels for all values.

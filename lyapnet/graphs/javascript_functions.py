@@ -14,7 +14,7 @@ from lyapnet.graphs.c_text import Tables, Text
 class JavaScriptTables(Tables):
     """The constants of JavaScript functions, with every bit."""
 
-    shares_transposes = False  # loops along columns are slower
+    shares_transposes = False  # loops along columns of a shared table would be slower
 
     def format_table(self, name: str, numbers: Tensor) -> str:
         content = base64.b64encode(numbers.numpy().astype("<f8").tobytes()).decode()
@@ -34,7 +34,7 @@ def javascript_function(
     """The text of a JavaScript function for a trace; its parameters are the arrays of arguments, then of results.
 
     Args:
-        name: of the function.
+        name: the name of the function.
         graph: a trace by `core_trace`, for one state.
         arguments: name of each array argument ↦ a tensor of its shape.
         results: the names of the arrays for the results.

@@ -48,7 +48,7 @@ def _mean_of_parts(
 
 
 def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None:
-    """The gradient as a kernel; None if it cannot be one."""
+    """The kernel of the gradient; None if there is none."""
     trained, of_state = len(trained_of(loss)), stateless(loss)
 
     def gradient(*tensors: Tensor) -> tuple[Tensor, ...]:

@@ -1,8 +1,8 @@
-"""The table of elementwise operators: each row has an operator in C, in CasADi and in the kernel for numbers.
+"""The table of elementwise operators: each row is an operator in C, in CasADi and in the kernel for numbers.
 
-A reader translates traces, with rules from these rows. It has further rules only for what a row cannot express:
-options, such as alpha in a sum, and operators that move, add or solve. lyapnet.prover.operators has the column of
-bounds, since a proof depends on that folder alone; `register` there takes a whole row with bounds.
+A reader translates traces with rules from these rows. It has further rules only for what rows cannot express: options,
+such as alpha in a sum, and operators that move entries, add them up or solve equations. The column of bounds is in
+lyapnet.prover.operators, since a proof depends on that folder alone; `register` there takes a whole row with bounds.
 """
 
 import math

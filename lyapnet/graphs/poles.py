@@ -1,4 +1,4 @@
-"""Poles: places where a denominator of a function vanishes and the function is unbounded.
+"""Poles: states at which a denominator of a function vanishes and the function is unbounded.
 
 An integration step may jump over a pole to states that no trajectory reaches, such as a negative stock of fish.
 Logarithms and roots need no such check, since they are nan outside of their domain.
@@ -17,8 +17,8 @@ from lyapnet.base.errors import LyapnetError, UntraceableError
 from lyapnet.base.types import State, StatePath
 from lyapnet.graphs.tracing import Tensors, core_trace, name_of
 
-HALVINGS = 50  # bisections of a step in which a denominator changes its sign
-GROWTH = 1e3  # a zero of a denominator is a pole if the function is larger there by this factor than at both ends
+HALVINGS = 50  # number of bisections of a step in which a denominator changes its sign
+GROWTH = 1e3  # factor by which a function must grow from both ends of a step to a zero of a denominator at a pole
 
 
 class Poles:

@@ -34,14 +34,14 @@ def trace(
     """The tensor operations that `function` runs for arguments of these shapes, including derivatives inside it.
 
     The result contains no Python code of the function and computes each expression once. It records no autograd graph,
-    so run it under no_grad. The tensors have no values during tracing: code that reads them (x.numpy(), float(x),
-    if x > 0), whose result would be frozen at these arguments, raises an error. Other values that the function reads
-    are frozen as they are now.
+    so run it under no_grad. Tensors have no values during tracing. Code that reads values (x.numpy(), float(x),
+    if x > 0) raises an error, because its result would be frozen at these arguments. Everything else that the function
+    reads is frozen at its present value.
 
     Args:
-        elsewhere: other values of its last arguments, on which the trace is compared with the function.
+        elsewhere: other values of the last arguments, at which the trace is compared with the function.
         decompositions: operator ↦ its implementation in simpler operators, for a reader that knows only these.
-        whole: whether lyapnet's own operators stay in the graph, for a reader that has them.
+        whole: whether lyapnet's own operators stay in the graph, for a reader that knows them.
 
     Raises:
         UsageError: the function draws random numbers, writes to tensors that outlive the call, or reads memory that was
@@ -59,12 +59,11 @@ def trace(
             f"on a tensor that outlives the call{place_of(monitor.written)}; fill constants in __init__, keep counters "
             "and logs outside, and call .eval() where there is a BatchNorm."
         )
-    for (
-        node
-    ) in graph_module.graph.nodes:  # torch writes a product with a vector in place; tracing it again would take as long
+    # torch squeezes products with a vector in place; a new trace without mutations would take as long as the first one
+    for node in graph_module.graph.nodes:
         if node.target is torch.ops.aten.squeeze_.dim and len(node.args[0].users) == 1:
             node.target = torch.ops.aten.squeeze.dim
-    if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut could separate a tensor from its assignments
+    if any(_mutates(node) for node in graph_module.graph.nodes):  # `cut` could separate a tensor from its assignments
         graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
         raise UntraceableError(
@@ -83,9 +82,8 @@ def trace(
     graph_module = _simplify(graph_module, graph_module.graph)
     _require_written_memory(graph_module.graph)
     if not WHOLE.isdisjoint(node.target for node in graph_module.graph.nodes):
-        _require_same(
-            graph_module, function, arguments
-        )  # lyapnet's operators differ from torch for arguments outside of their domain
+        # lyapnet's operators differ from torch's for arguments outside of their domain
+        _require_same(graph_module, function, arguments)
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
@@ -97,16 +95,14 @@ def core_trace(
     """The trace of a function in torch's core operators, for a reader that translates them to another language.
 
     Args:
-        what: a name of the function for messages.
+        what: the name of the function in messages.
         refusal: the class of the error if it cannot be traced.
     """
-    # an operator may have been registered since the last trace
+    # not cached, as an operator may have been registered since the last trace
     simpler = {target: others for target, others in _core_decompositions().items() if not _has_row(target)}
     try:
-        with torch.no_grad():
-            return trace(
-                lambda *a: function(*a), arguments, decompositions=simpler
-            )  # lambda: make_fx would count `self` as an argument
+        with torch.no_grad():  # in a lambda, because make_fx would count `self` as an argument
+            return trace(lambda *a: function(*a), arguments, decompositions=simpler)
     except LyapnetError as error:
         raise refusal(str(error)) from error
     except Exception as error:  # user code may raise anything
@@ -119,12 +115,12 @@ def core_trace(
 
 @cache
 def _core_decompositions() -> Mapping[Any, Any]:
-    """Operator ↦ its implementation in core operators; kept, since torch goes through all its operators to make it."""
+    """Operator ↦ its implementation in core operators; cached, since torch goes through all operators to make it."""
     return {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
 
 
 def _has_row(target: Any) -> bool:
-    """Whether the table of operators has C and CasADi for this overload, which takes only tensors."""
+    """Whether the table of operators has this overload, which takes only tensors, in C and CasADi."""
     row = OPERATORS.get(name_of(target))
     return row is not None and row.c is not None and row.casadi is not None and target is row.overloads[0]
 
@@ -150,9 +146,9 @@ def _overwrites(node: Node, memory: Node) -> bool:
 
 
 class _Monitor(TorchFunctionMode):
-    """Raises an error if code reads values of a tensor without values, even if that code catches torch's error.
+    """Raises an error if code reads values of a traced tensor, also if the code catches torch's error.
 
-    Such code may also convert the tensor to text, which raises no error in torch.
+    Converting a tensor to text counts as reading, although torch raises no error for it.
     """
 
     refusal: Exception | None = None
@@ -208,7 +204,7 @@ def cut(
     and then the intermediate results that the rest needs. rest(*arguments, *intermediate) returns the other results.
 
     Args:
-        repeat: whether the rest repeats arithmetic that is cheaper than passing its result.
+        repeat: whether the rest repeats cheap arithmetic instead of receiving its results.
     """
     nodes = list(graph_module.graph.nodes)
     arguments, results = [node for node in nodes if node.op == "placeholder"], _results(graph_module.graph)
@@ -247,7 +243,7 @@ POINTWISE = {"add", "sub", "rsub", "neg", "mul", "div", "pow", "sigmoid_backward
 
 
 def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
-    """The nodes to compute again rather than to pass: arguments, constants, views and cheap operators."""
+    """The nodes that the rest computes again instead of receiving them: arguments, constants, views, cheap ones."""
     return {
         node
         for node in nodes
@@ -257,7 +253,7 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
 
 
 def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> None:
-    """Compare a trace with its function, up to half of the digits, since sums may be in another order."""
+    """Refuse a trace that differs from its function in the first half of the digits; sums may be in another order."""
     with torch.no_grad():
         results, expected = graph_module(*arguments), function(*arguments)
     for result, value in zip(results, expected, strict=True):

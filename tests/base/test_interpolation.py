@@ -16,7 +16,7 @@ from lyapnet.base.interpolation import (
     SmoothCurve,
     fewest_products,
 )
-from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.graphs.casadi_functions import casadi_function, require_equal, trace_for_casadi
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.value.calculus import gradients
 from tests.functions import box, points_in
@@ -91,7 +91,7 @@ def test_values_and_derivatives_lie_within_bounds(method, surface):
 def test_casadi_knows_it(method, surface):
     table = lyapnet.Table([NODES, OTHER], surface, method)
     arguments = (torch.zeros(2),)
-    translated = symbolic(traced(lambda x: (table(x),), arguments), arguments)
+    translated = casadi_function(trace_for_casadi(lambda x: (table(x),), arguments), arguments)
     require_equal(translated, lambda x: (table(x),), arguments)
 
 

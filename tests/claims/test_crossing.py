@@ -5,7 +5,7 @@ import torch
 
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.checking import check
-from lyapnet.claims.crossing import beginning_level, crossing_level, find_violation
+from lyapnet.claims.crossing import crossing_level, find_violation, initial_violation_level
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.controller.controller import Controller
@@ -259,7 +259,7 @@ def test_states_of_X0_between_the_samples_are_checked():
     sliver = task.replaced(constraints=Sliver())
     assert find_violation(loop(riccati()), sliver, torch.Generator().manual_seed(0)) is None
     least = [
-        beginning_level(DecreaseCondition(loop(riccati()), 0.9, 0.0, h), at, Budget(5), ENOUGH)
+        initial_violation_level(DecreaseCondition(loop(riccati()), 0.9, 0.0, h), at, Budget(5), ENOUGH)
         for h in (Sliver(), position(1.0), None)
     ]
     P, x = torch.as_tensor(riccati()), torch.tensor([0.9, 0.1234]).double()

@@ -117,7 +117,7 @@ def claim(system=None, cost=None, V=None, law=HJBPolicy, loop=ClosedLoop, contro
     domain = Box([-side] * n, [side] * n)
     options = {"alpha": ALPHA, "delta": DELTA, "states": domain, "budget": Budget(BRIEF, boxes=BOXES), **options}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(funnel, "LEVELS", AMPLE if options["budget"].seconds == AMPLE else LEVELS)
+        patch.setattr(funnel, "MAX_LEVEL_SECONDS", AMPLE if options["budget"].seconds == AMPLE else LEVELS)
         return prove_funnel(closed_loop, problem, **options)
 
 

@@ -242,7 +242,7 @@ def test_the_enclosing_box_reaches_around_the_level_set(P):
 
 @pytest.mark.gate
 def test_a_tiny_budget_proves_nothing_and_falsifies_nothing(P, monkeypatch):
-    monkeypatch.setattr(funnels, "LEAST", AMPLE)  # seconds for levels, enough on a busy machine too
+    monkeypatch.setattr(funnels, "MIN_LEVEL_SECONDS", AMPLE)  # seconds for levels, enough on a busy machine too
     claim = certify(loop(P), budget=Budget(1e-6))
     assert claim.verdict == "unknown"
     assert re.fullmatch(r"seconds spent, \d+ of them before the first box: .*", claim.reason)

@@ -29,7 +29,7 @@ UNSTABLE = [[2.0, 0.0], [0.3, 1.0]]
 @pytest.fixture(autouse=True)
 def _little_time_for_levels(monkeypatch):
     """The levels of a V that cannot be certified take all the time that is allowed."""
-    monkeypatch.setattr(funnel, "LEVELS", 5.0)
+    monkeypatch.setattr(funnel, "MAX_LEVEL_SECONDS", 5.0)
 
 
 class Bowl(ValueFunction):
@@ -136,7 +136,7 @@ def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
 @pytest.mark.gate
 @pytest.mark.parametrize("V", [Bowl(-2.0), Bowl(0.05)], ids=["wrong sign", "too small"])
 def test_a_wrong_value_function_is_falsified(V, monkeypatch):
-    monkeypatch.setattr(funnel, "LEVELS", 0.5)
+    monkeypatch.setattr(funnel, "MAX_LEVEL_SECONDS", 0.5)
     found = claim(loop(V), 0.5, 0.02, Box(LOWER[1:], UPPER[1:]), Budget(AMPLE, boxes=2000))
     assert found.verdict == "falsified"
 

@@ -146,7 +146,7 @@ def certifiable(*arguments, **own):
 @pytest.mark.gate
 def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(certify.Given, "load", certifiable)
-    monkeypatch.setattr(funnel, "LEVELS", 20.0)
+    monkeypatch.setattr(funnel, "MAX_LEVEL_SECONDS", 20.0)
     path = str(tmp_path / "kept.proof")
     options = ["--alpha", "0.9", "--delta", "0.05", "--keep", path]
     found = certificate(capsys, "sound", checkpoint, *options)
@@ -178,7 +178,7 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("kind", [["region"], ["sound", "--two-sided", "--alpha=0.9", "--delta=0.05"]])
 def test_kept_proofs_of_other_kinds_are_checked(kind, checkpoint, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(certify.Given, "load", certifiable)
-    monkeypatch.setattr(funnel, "LEVELS", 20.0)
+    monkeypatch.setattr(funnel, "MAX_LEVEL_SECONDS", 20.0)
     path = str(tmp_path / "kept.proof")
     found = certificate(capsys, *kind, checkpoint, "--keep", path)
     assert found["rho"] > 0

@@ -1,11 +1,11 @@
 """Loops that are joined, numbers in the place of arrays, memory that is used again; and what has to stay apart."""
 
-from lyapnet.graphs.c_loops import Statement, arranged
+from lyapnet.graphs.c_loops import Statement, arrange_statements
 
 
 def lines_of(*statements, **sizes):
     """(lines, numbers in memory) of statements, each as (sizes of its loops, line)."""
-    return arranged([Statement(tuple(loops), line) for loops, line in statements], sizes)
+    return arrange_statements([Statement(tuple(loops), line) for loops, line in statements], sizes)
 
 
 def test_loops_over_the_same_entries_are_one_and_their_arrays_numbers():

@@ -7,11 +7,11 @@ from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import OracleError
-from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.graphs.casadi_functions import casadi_function, require_equal, trace_for_casadi
 
 
 def translated(function, arguments):
-    result = symbolic(traced(function, arguments), arguments)
+    result = casadi_function(trace_for_casadi(function, arguments), arguments)
     require_equal(result, function, arguments)
     return result
 
@@ -80,7 +80,7 @@ def test_operations_of_user_systems_are_translated(name):
 
 def test_a_wrong_rule_is_found():
     x = torch.zeros(1, 2)
-    wrong = symbolic(traced(lambda x: (torch.sin(x),), (x,)), (x,))
+    wrong = casadi_function(trace_for_casadi(lambda x: (torch.sin(x),), (x,)), (x,))
     with pytest.raises(OracleError, match="an error of"):
         require_equal(wrong, lambda x: (torch.sin(1.000001 * x),), (x,))
 
@@ -88,4 +88,4 @@ def test_a_wrong_rule_is_found():
 def test_an_operator_without_a_rule_is_named():
     x = torch.zeros(1, 2)
     with pytest.raises(OracleError, match=r"^Expected operations .*, got aten.special_bessel_j0.default; write it"):
-        symbolic(traced(lambda x: (torch.special.bessel_j0(x),), (x,)), (x,))
+        casadi_function(trace_for_casadi(lambda x: (torch.special.bessel_j0(x),), (x,)), (x,))

@@ -91,7 +91,9 @@ def by_c(row, folder):
 
 def by_casadi(row):
     function, x, _ = case(row)
-    (y,) = casadi_functions.symbolic(casadi_functions.traced(function, [x]), [x]).call([x.flatten().numpy()])
+    (y,) = casadi_functions.casadi_function(casadi_functions.trace_for_casadi(function, [x]), [x]).call(
+        [x.flatten().numpy()]
+    )
     return torch.tensor(np.array(y)).flatten()
 
 

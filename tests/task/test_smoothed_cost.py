@@ -8,7 +8,7 @@ import lyapnet
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import Parts
 from lyapnet.experiment.config import config_from_plain
-from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.graphs.casadi_functions import casadi_function, require_equal, trace_for_casadi
 from lyapnet.graphs.tracing import trace
 from lyapnet.task.cost import PenaltyCost, SmoothedCost
 from lyapnet.task.domain import Border, DomainCost, as_written
@@ -164,7 +164,7 @@ def test_traces_are_the_functions():
     for result, value in zip(trace(both, (x,))(x), both(x), strict=True):
         assert_close(result, value)
     one = torch.zeros(1, 2, dtype=torch.float64)
-    require_equal(symbolic(traced(both, (one,)), (one,)), both, (one,))
+    require_equal(casadi_function(trace_for_casadi(both, (one,)), (one,)), both, (one,))
 
 
 def test_what_trains_is_rounded():

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.base.types import Control, PerState, State
-from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.graphs.casadi_functions import casadi_function, require_equal, trace_for_casadi
 from lyapnet.graphs.tracing import Tensors
 from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCost, ControlCosts, PowerCost
 from lyapnet.task.problem import Problem
@@ -101,7 +101,7 @@ class CasadiTask:
         own = self.problem.cost.nonquadratic
         if own is None:
             return None, []
-        self.graphs.append(traced(lambda u: (own(u),), (u,)))  # which identifies the task
+        self.graphs.append(trace_for_casadi(lambda u: (own(u),), (u,)))  # which identifies the task
         kinked: list[ControlCost] = [
             *own.kinked, *(part for part in own.separable if isinstance(part, PowerCost) and part.exponent < 2)
         ]  # fmt: skip
@@ -111,7 +111,7 @@ class CasadiTask:
         return self._translate(lambda u: (ControlCosts(smooth)(u),), (u,)), kinked
 
     def _translate(self, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> casadi.Function:
-        self.graphs.append(traced(function, arguments))
-        translated = symbolic(self.graphs[-1], arguments)
+        self.graphs.append(trace_for_casadi(function, arguments))
+        translated = casadi_function(self.graphs[-1], arguments)
         require_equal(translated, function, arguments)
         return translated

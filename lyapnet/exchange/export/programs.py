@@ -24,7 +24,7 @@ from lyapnet.graphs.tracing import name_of
 RESULTS = ["u", "V"]
 aten = torch.ops.aten
 FILLED = ("full", "full_like", "new_full")
-WITH_TENSORS = {  # operators ↦ those that take tensors in the place of numbers
+WITH_TENSORS = {  # operator ↦ the one that takes tensors instead of numbers
     **{
         getattr(operator, kind): operator.Tensor
         for operator in (aten.add, aten.sub, aten.mul, aten.div, aten.remainder)
@@ -32,15 +32,15 @@ WITH_TENSORS = {  # operators ↦ those that take tensors in the place of number
     },
     aten.clamp.default: aten.clamp.Tensor,
 }
-SIMPLER: dict[Any, Any] = {aten.tan.default: lambda v: v.sin() / v.cos()}  # onnxruntime has none in double precision
-ABOUT = "lyapnet.json"  # in a program of torch.export
+SIMPLER: dict[Any, Any] = {aten.tan.default: lambda v: v.sin() / v.cos()}  # onnxruntime has no tan of float64
+ABOUT = "lyapnet.json"  # the file of facts in a program of torch.export
 
 
 def program_of(law: Law) -> torch.export.ExportedProgram:
-    """The law as torch.export has it.
+    """The law as a program of torch.export.
 
     Raises:
-        ExportError: it has operations that torch.export does not take.
+        ExportError: torch.export does not support one of its operations.
     """
     with _quiet("torch.export does not take"), torch.no_grad():
         graph = _one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
@@ -49,7 +49,7 @@ def program_of(law: Law) -> torch.export.ExportedProgram:
 
 @contextmanager
 def _quiet(what: str) -> Iterator[None]:
-    """Nothing of what torch says about itself, and one line of what it raises."""
+    """A context without torch's log and warnings, in which its exceptions become an ExportError of one line."""
     log = logging.getLogger("torch")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -59,7 +59,7 @@ def _quiet(what: str) -> Iterator[None]:
             yield
     except LyapnetError:
         raise
-    except Exception as error:  # of many kinds
+    except Exception as error:  # torch and onnx raise many kinds
         line = one_line(error)[:200]
         raise ExportError(
             f"Expected a law without operations that {what}, got {type(error).__name__}: {line}; choose another --to."
@@ -69,7 +69,7 @@ def _quiet(what: str) -> Iterator[None]:
 
 
 def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
-    """A copy with tensors for the numbers in its arithmetic, which ONNX would round to float32."""
+    """A copy with tensors instead of the numbers in its arithmetic, which ONNX would round to float32."""
     graph = copy.deepcopy(graph)
     for node in [node for node in graph.graph.nodes if node.op == "call_function"]:
         if node.target is aten.slice_scatter.default:
@@ -91,7 +91,7 @@ def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
 
 
 def _end_within(node: Node) -> None:
-    """Gives a slice_scatter without end the size of its axis: torch.vmap overflows at the largest integer."""
+    """Replace a missing end of a slice_scatter by the size of its axis, since torch.vmap overflows at its default."""
     given: dict[str, Any] = dict(zip(("whole", "part", "axis", "start", "end"), node.args, strict=False))
     if given.get("end") is not None:
         node.update_arg(4, min(given["end"], given["whole"].meta["val"].shape[given["axis"]]))
@@ -107,12 +107,12 @@ def _constant_before(node: Node, graph: GraphModule, value: torch.Tensor, place:
 
 
 def write_torch(program: torch.export.ExportedProgram, path: Path, about: dict[str, Any]) -> None:
-    """A file for `torch.export.load`, with what it is in its extra file ABOUT."""
+    """Write a file for `torch.export.load`, with the facts in its extra file ABOUT."""
     torch.export.save(program, path, extra_files={ABOUT: json.dumps(about)})
 
 
 def run_torch(path: Path, law: Law) -> Evaluate:
-    """What a saved program says of many states at once."""
+    """The results of a saved program for many states."""
     module, like = torch.export.load(path).module(), law.arguments["x"]
 
     def evaluate(t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
@@ -144,13 +144,13 @@ def onnx_model_of(law: Law) -> Any:
 
 
 def write_onnx(model: Any, path: Path, about: dict[str, Any]) -> None:
-    """A model's file, with what it is in its metadata."""
+    """Write a model's file, with the facts in its metadata."""
     model.model.metadata_props.update({key: str(value) for key, value in about.items()})
     model.save(path)
 
 
 def run_onnx(path: Path, law: Law) -> Evaluate:
-    """What a model says in onnxruntime, one state after another.
+    """The results of a model in onnxruntime, which runs one state after another.
 
     Raises:
         ExportError: onnxruntime lacks an operation in this precision.
@@ -180,7 +180,7 @@ def run_onnx(path: Path, law: Law) -> Evaluate:
 
 
 def casadi_function_of(law: Law) -> Any:
-    """The law as a CasADi function (t, x[, p]) ↦ (u, V, V_x), with the derivative that CasADi makes of V.
+    """The law as a CasADi function (t, x[, p]) ↦ (u, V, V_x), where V_x is CasADi's derivative of V.
 
     Raises:
         ExportError: CasADi is missing, or an operation has no counterpart in it.
@@ -188,11 +188,11 @@ def casadi_function_of(law: Law) -> Any:
     try:
         import casadi
 
-        from lyapnet.graphs.casadi_functions import symbolic
+        from lyapnet.graphs.casadi_functions import casadi_function
     except ImportError as error:
         raise ExportError(f"Expected CasADi, got {error}; pip install 'lyapnet[oracle]'.") from error
     try:
-        translated = symbolic(law.both, list(law.arguments.values()))
+        translated = casadi_function(law.both, list(law.arguments.values()))
     except OracleError as error:
         raise ExportError(str(error)) from error
     arguments = [casadi.SX.sym(name, argument.numel()) for name, argument in law.arguments.items()]
@@ -202,12 +202,12 @@ def casadi_function_of(law: Law) -> Any:
 
 
 def write_casadi(function: Any, path: Path, about: dict[str, Any]) -> None:
-    """A file for `casadi.Function.load`, which has no place for what it is about."""
+    """Write a file for `casadi.Function.load`; this format has no place for facts."""
     function.save(str(path))
 
 
 def run_casadi(path: Path, law: Law) -> Evaluate:
-    """What a saved CasADi function says of many states at once."""
+    """The results of a saved CasADi function for many states."""
     import casadi
 
     function = casadi.Function.load(str(path))
@@ -220,7 +220,7 @@ def run_casadi(path: Path, law: Law) -> Evaluate:
 
 
 def _one_number_at_a_time(module: nn.Module) -> nn.Module:
-    """A copy with torch.where for g[2, 0] = 1, which the compiler refuses for a single number."""
+    """A copy with torch.where for assignments such as g[2, 0] = 1, which the compiler refuses for single numbers."""
     module, aten = copy.deepcopy(module), torch.ops.aten
     for graph_module in (each for each in module.modules() if isinstance(each, GraphModule)):
         graph = graph_module.graph

@@ -1,4 +1,4 @@
-"""Programs with memory for their runs, and the calls of the compiled C++."""
+"""Programs with memory for their runs, and calls of the compiled C++."""
 
 import ctypes
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
 
 SOURCE = Path(__file__).with_name("program.cpp")
-NUMBERS = {torch.float64: "double", torch.float32: "float"}  # their names in C++
+NUMBERS = {torch.float64: "double", torch.float32: "float"}  # type of numbers ↦ its name in C++
 
 
 @cache
@@ -70,7 +70,7 @@ class AssembledProgram:
         self._idle = list[_Memory]()  # of finished runs; each run needs its own
 
     def arguments(self, examples: Sequence[Tensor], varying: int) -> list[Tensor]:
-        """Declare arguments; the last `varying` ones change in each step. Return copies of the examples."""
+        """Declare arguments, of which the last `varying` ones change in each step; return copies of the examples."""
         copies = [each.detach().contiguous().clone() for each in examples]
         for k, example in enumerate(copies):
             is_number = example.dtype in (self.dtype, torch.bool)
@@ -106,7 +106,7 @@ class AssembledProgram:
         del self.writer  # and with it the tensors that torch computed from the examples
 
     def is_scan(self, columns: int) -> bool:
-        """Whether x and each column have numbers, and x' has the shape of x."""
+        """Whether the program can run a scan: x and each column are not empty, and x' has the shape of x."""
         return min(self._arguments[-columns - 1 :]) >= 0 and self.result_shapes[0] == self._shapes[-1]
 
     def new_results(self) -> list[Tensor]:
@@ -145,7 +145,7 @@ class AssembledProgram:
             )  # fmt: skip
 
     def _convert(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
-        """Arguments in the type and layout that the program reads.
+        """The arguments in the type and memory layout that the program reads.
 
         Raises:
             ValueError: shapes, devices or frozen values differ from those of the examples.

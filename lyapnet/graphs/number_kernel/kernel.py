@@ -13,15 +13,14 @@ from lyapnet.graphs.number_kernel.assembly import AssembledProgram
 from lyapnet.graphs.number_kernel.rewriting import rewrite
 from lyapnet.graphs.scan import Scan
 
-CHECKED = 2  # steps of a scan that are compared with torch
+CHECKED = 2  # number of steps of a scan that are compared with torch
 Kernel = TypeVar("Kernel", bound="NumberKernel | ScanKernel")
 
 
 class NumberKernel:
-    """A graph of tensor operations for arguments of some shapes, as a program; booleans in its results are 1 and 0.
+    """A graph of tensor operations for arguments of given shapes, as a program; booleans in its results are 1 and 0.
 
-    Its results differ from torch's by rounding, since sums are taken in another order. They do not depend on the number
-    of threads, since a call runs on one.
+    Its results differ from torch's by rounding, since sums are taken in another order. A call runs on one thread.
 
     Args:
         graph: a trace.
@@ -111,7 +110,7 @@ def _split(arguments: Sequence[Tensor], columns: int) -> tuple[Sequence[Tensor],
 
 
 def _require_same(results: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
-    """Compare a program with its graph up to a third of the digits, so that no wrong rule is used in training."""
+    """Refuse a program whose results differ from its graph's in the first third of the digits, as by a wrong rule."""
     for result, value in zip(results, expected, strict=True):
         if not are_close(result, value.to(result.dtype), THIRD):
             raise NotImplementedError("another result than torch's")

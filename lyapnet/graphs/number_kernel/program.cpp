@@ -171,7 +171,7 @@ inline V logistic(V x) {
     return x < 0 ? u * large : (x != x ? x : large);
 }
 
-// (1 − u)/(1 + u) with u = e^(−2|x|), and where that loses digits e/(e + 2) with e = e^(2|x|) − 1
+// tanh |x| = (1 − u)/(1 + u) with u = e^(−2|x|); for small |x|, where this cancels, e/(e + 2) with e = e^(2|x|) − 1
 template <class T, class V>
 inline V hyperbolic_tangent(V x) {
     const V size = absolute<T, V>(x), u = exponential(-2 * size), e = exponential_less_one(2 * size);
@@ -314,7 +314,7 @@ void reduction(const Machine<T> &machine, const Integer *row) {
     });
 }
 
-// out = where the largest or the least of an input is along the last axis, the first one of several; nan before all
+// out = the index of the largest or least number of an input along the last axis; of several the first; nan counts most
 template <class T, bool LARGEST>
 void extreme(const Machine<T> &machine, const Integer *row) {
     const int rank = *row++;
@@ -334,7 +334,7 @@ void extreme(const Machine<T> &machine, const Integer *row) {
     });
 }
 
-// out = input[index], or out[index] = input, along an axis of what is indexed, which has stride 0 there
+// out = input[index], or out[index] = input, along an axis; the indexed operand has stride 0 along it
 template <class T, bool INTO>
 void indexed(const Machine<T> &machine, const Integer *row) {
     const Integer size = row[0], stride = row[1];
@@ -356,7 +356,7 @@ void indexed(const Machine<T> &machine, const Integer *row) {
     });
 }
 
-// out[to] = input[from], or out[to] += input[from], at tabled positions
+// out[to] = input[from], or out[to] += input[from], with tables of the positions
 template <class T, bool ADD>
 void moved(const Machine<T> &machine, const Integer *row) {
     const Integer count = row[0], *to = machine.tables + row[1], *from = machine.tables + row[2];
@@ -372,7 +372,7 @@ void moved(const Machine<T> &machine, const Integer *row) {
 
 constexpr int COLUMNS = 2;  // vectors of a panel of packed columns
 
-// Panels of B (K, N): COLUMNS vectors of columns of all rows, filled up with zeros
+// Packs B (K, N) into panels, each with COLUMNS vectors of columns for all rows, padded with zeros
 template <class T>
 void packed(const Machine<T> &machine, const Integer *row) {
     const Integer K = row[0], N = row[1], k_stride = row[4], n_stride = row[5];
@@ -412,7 +412,7 @@ inline void tile(Integer K, const T *A, Integer m_stride, Integer k_stride, cons
         }
 }
 
-// out (M, N) = A (M, K) B (K, N), or out += A B, for packed B; rows of out are in line
+// out (M, N) = A (M, K) B (K, N), or out += A B, for packed B; the rows of out are contiguous
 template <class T>
 void product_with_packed(const Machine<T> &machine, const Integer *row) {
     VECTOR;
@@ -436,16 +436,16 @@ void product_with_packed(const Machine<T> &machine, const Integer *row) {
     }
 }
 
-// A (M, K) and B (K, N) of a batch of products, as they lie in memory
+// A (M, K) and B (K, N) of a batch of products, with their strides in memory
 template <class T>
 struct Factors {
     const T *A, *B;
     Integer m_stride, k_of_a, k_of_b, n_stride, M, N, K;
 };
 
-constexpr int MOST_COPIED = 2048;  // numbers of a factor that is put in line first
+constexpr int MOST_COPIED = 2048;  // largest number of entries of a factor that is copied first
 
-// Sums run along lines of A and of B
+// For contiguous rows of A: sums of products along these and along columns of B, which are copied unless contiguous
 template <class T>
 void by_lines(const Factors<T> &f, T *out, Integer row_stride, Integer column_stride, bool add) {
     VECTOR;
@@ -469,7 +469,7 @@ void by_lines(const Factors<T> &f, T *out, Integer row_stride, Integer column_st
         }
 }
 
-// Several rows of A at once, which lie side by side, for N columns
+// For columns of A that are contiguous: several rows at once, for N columns
 template <class T, int N>
 void by_rows(const Factors<T> &f, T *out, Integer row_stride, Integer column_stride, bool add) {
     VECTOR;
@@ -488,7 +488,7 @@ void by_rows(const Factors<T> &f, T *out, Integer row_stride, Integer column_str
     }
 }
 
-// Several columns of B at once, which lie side by side
+// For rows of B that are contiguous: several columns at once
 template <class T>
 void by_columns(const Factors<T> &f, T *out, Integer row_stride, bool add) {
     VECTOR;
@@ -504,7 +504,7 @@ void by_columns(const Factors<T> &f, T *out, Integer row_stride, bool add) {
         }
 }
 
-// The same for batches of small matrices, as they are
+// Products of batches of small matrices, which are not packed
 template <class T>
 void products(const Machine<T> &machine, const Integer *row) {
     const Integer batch = row[0], M = row[1], N = row[2], K = row[3];
@@ -578,7 +578,7 @@ void symmetric_inverse(const Machine<T> &machine, const Integer *row) {
     });
 }
 
-// The solution of A v = v, in the place of v, for the lower triangle of symmetric positive definite A, which it uses up
+// Replaces v by the solution x of A x = v, from the lower triangle of symmetric positive definite A, which is overwritten
 template <class T>
 inline void solve_in_place(int d, T (&A)[MOST_UNKNOWNS][MOST_UNKNOWNS], T *v) {
     for (int j = 0; j < d; j++) {  // A = L Lᵀ
@@ -599,9 +599,9 @@ inline void solve_in_place(int d, T (&A)[MOST_UNKNOWNS][MOST_UNKNOWNS], T *v) {
 
 constexpr int ROUNDS = 4;  // for each control, as in sets.py
 
-// Which of m controls are at a limit where uᵀRu + bᵀu is least: −1 at the lower, 1 at the upper, 0 at none. In each round
-// towards the minimum over those that no limit holds, up to the first limit on the way, which holds from there; or all
-// the way, and then of the held ones that is let go which gains most.
+// For each of m controls, whether it is at a limit where uᵀRu + bᵀu is least: −1 at the lower one, 1 at the upper one, 0
+// at none. Each round moves u towards the minimum over the controls that are not fixed at a limit. The first limit on the
+// way fixes its control; if there is none, the fixed control with the largest gain is released.
 template <class T>
 void find_active_set(int m, const T (&R)[MOST_UNKNOWNS][MOST_UNKNOWNS], const T *b, const T *low, const T *high, T *side) {
     T u[MOST_UNKNOWNS], A[MOST_UNKNOWNS][MOST_UNKNOWNS], step[MOST_UNKNOWNS];

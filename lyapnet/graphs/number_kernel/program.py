@@ -1,4 +1,4 @@
-"""Flat programs on tensors: instructions as rows of integers, their memory, and instructions that all steps share."""
+"""Flat programs on tensors: instructions as rows of integers, and their memory; some are shared by all steps."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import MOST_UNKNOWNS
 from lyapnet.graphs.operators import OPERATORS
 
-# in the order of INSTRUCTIONS in program.cpp; those of `elementwise_instructions` come after them
+# in the order of INSTRUCTIONS in program.cpp, which are followed by `elementwise_instructions`
 OPERATIONS = (
     "reduce_sum", "reduce_maximum", "reduce_minimum", "index_of_largest", "index_of_least", "take_at_index",
     "put_at_index", "move", "add_moved", "pack", "product_with_packed", "products", "symmetric_inverse", "active_set",
@@ -56,9 +56,9 @@ class Buffer:
     """Memory of a program: from its caller, a constant, or a part of the arena."""
 
     numbers: int
-    varies: bool  # whether it changes from step to step
+    varies: bool  # whether its numbers change from step to step
     constant: Tensor | None = None
-    given: bool = False  # whether the caller passes it at each call
+    given: bool = False  # whether it belongs to an argument or a result of each call
 
 
 class Program:
@@ -158,7 +158,7 @@ class Program:
         self._append("product_with_packed", row, reads, out.buffer)
 
     def multiply_batch(self, batch: int, shape: tuple[int, int, int], places: Sequence[Place], add: bool) -> None:
-        """The same for a batch of small matrices; the batch is the first axis."""
+        """Like `multiply`, for a batch of small matrices; the batch is the first axis of the strides."""
         row, (out, A, B) = [batch, *shape, int(add)], places
         for place in places:
             row += [place.buffer, place.offset, *place.strides]
@@ -216,9 +216,8 @@ class Program:
         alive: list[tuple[int, int, int]] = []  # (offset, numbers, end)
         in_arena = [b for b in begins if self.buffers[b].constant is None and not self.buffers[b].given]
         for buffer in sorted(in_arena, key=lambda b: begins[b]):
-            size = (
-                -(-self.buffers[buffer].numbers // line) * line + line
-            )  # vector instructions may read beyond the last number
+            # one more line, because vector instructions may read beyond the last number
+            size = -(-self.buffers[buffer].numbers // line) * line + line
             alive = sorted(each for each in alive if each[2] >= begins[buffer])
             offset = 0
             for start, numbers, _ in alive:

@@ -1,4 +1,4 @@
-"""Rewrites traced graphs in fewer operations, where the kernel has one operation for several."""
+"""Rewrites traced graphs: replaces several operations by one that the kernel has."""
 
 from collections.abc import Iterator
 from typing import Any

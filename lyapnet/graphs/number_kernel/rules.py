@@ -1,4 +1,4 @@
-"""Rules that write torch's operators as instructions: a rule is called with (writer, result, *arguments)."""
+"""Rules that write torch's operators as instructions: (writer, result, *arguments) ↦ instructions for the result."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,14 +11,8 @@ from lyapnet.graphs.number_kernel.program import Place
 from lyapnet.graphs.number_kernel.writing import Number, Writer
 from lyapnet.graphs.operators import Rules
 
-OF_MEMORY = {
-    "memory_format",
-    "dtype",
-    "layout",
-    "device",
-    "pin_memory",
-    "non_blocking",
-}  # options without an effect on numbers
+OF_MEMORY = {"memory_format", "dtype", "layout", "device", "pin_memory", "non_blocking"}
+"""Options of copies that do not change numbers."""
 POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "sqrt", -0.5: "rsqrt"}
 
 
@@ -74,7 +68,7 @@ def _subtract_from(writer: Writer, out: Tensor, x: Number, y: Number, alpha: flo
 
 
 def _divide(writer: Writer, out: Tensor, x: Number, y: Number, rounding_mode: str | None = None) -> None:
-    if rounding_mode == "floor":  # ⌊x/y⌋ would be wrong where x/y is rounded up to an integer
+    if rounding_mode == "floor":  # ⌊x/y⌋ would be wrong if x/y is rounded up to an integer
         raise NotImplementedError("a floor division")
     writer.elementwise("div", out, x, y)
     if rounding_mode is not None:
@@ -106,7 +100,7 @@ def _masked_fill(writer: Writer, out: Tensor, x: Tensor, mask: Tensor, value: Nu
 
 
 def _logical(operation: str) -> Callable[..., None]:
-    """A rule for booleans, not for the bits of integers."""
+    """A rule for booleans; bits of integers are refused."""
 
     def write(writer: Writer, out: Tensor, x: Number, y: Number) -> None:
         if any(not isinstance(each, Tensor) or each.dtype != torch.bool for each in (out, x, y)):
@@ -260,7 +254,7 @@ def _slice_scatter(
 
 
 def _backward_of(scatter: Callable[..., None]) -> Callable[..., None]:
-    """A rule for the backward operator: the costate at the selected places, and zeros elsewhere."""
+    """A rule for the backward operator of a selection: the costate at the selected entries, and zeros elsewhere."""
     return lambda writer, out, costate, sizes, *places: scatter(writer, out, 0, costate, *places)
 
 

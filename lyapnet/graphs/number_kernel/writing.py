@@ -1,7 +1,7 @@
 """Writes traced graphs as programs on tensors, node by node.
 
-torch runs each node once, on example arguments. A result that shares memory with an argument is a view, and needs no
-instruction. The program stores each result with the same strides as torch.
+torch runs each node once, on example arguments. A result that shares memory with an argument is a view and needs no
+instruction. The program stores all results with torch's strides.
 """
 
 import math
@@ -35,7 +35,7 @@ class Writer:
         self.program, self.width, self.rules = program, width, rules
         self._buffers = dict[int, int]()  # address of a tensor's memory ↦ buffer
         self._constants = dict[Any, int]()
-        self._alive: list[Any] = []  # tensors that are kept so that their addresses are not used again
+        self._alive: list[Any] = []  # keeps tensors alive, so that no other tensor gets their address
 
     def argument(self, example: Tensor, varies: bool) -> int:
         """The buffer of an argument of numbers or booleans, with the strides of the example."""
@@ -101,7 +101,7 @@ class Writer:
     # --- For rules ---
 
     def is_written(self, tensor: Tensor) -> bool:
-        """Whether a tensor depends on arguments; otherwise it is a constant."""
+        """Whether a tensor depends on arguments, and so has a buffer; otherwise it is a constant."""
         return tensor.untyped_storage().data_ptr() in self._buffers and tensor.numel() > 0
 
     def varies(self, tensor: Tensor) -> bool:

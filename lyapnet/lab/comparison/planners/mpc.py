@@ -12,7 +12,7 @@ from lyapnet.base.errors import OracleError, UsageError
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.exchange.export.law import Law
-from lyapnet.graphs.casadi_functions import symbolic
+from lyapnet.graphs.casadi_functions import casadi_function
 from lyapnet.lab.comparison.planners.planner import LoopLaw, Planner
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import riccati
@@ -157,7 +157,7 @@ def terminal_cost_of_regulator(problem: Problem) -> TerminalCost:
 def learned_terminal_cost(controller: Controller) -> TerminalCost:
     """V(t, x) of a controller of one system, in float64."""
     law = Law(controller)
-    value = symbolic(law.value, list(law.arguments.values()))
+    value = casadi_function(law.value, list(law.arguments.values()))
     x, t = casadi.SX.sym("x", controller.system.n), casadi.SX.sym("t")
     (cost,) = value.call([t, x])
     times = controller.horizon.dt * np.arange(controller.horizon.steps + 1)

@@ -1,1 +1,1 @@
-"""What comes from elsewhere and goes elsewhere: imported laws, exported ones, a page to look at."""
+"""Exchange with other programs: imported laws, exported laws, and an interactive page."""

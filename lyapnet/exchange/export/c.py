@@ -27,16 +27,16 @@ from lyapnet.task.sets import ControlBox, ControlSet
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wpedantic", "-Werror")
 FLAGS = (*STRICT, "-O2")
 FAST = ("-std=c99", "-O3")
-NAME = "lyapnet"  # what names begin with, unless told otherwise
+NAME = "lyapnet"  # default of the first part of all names
 
 
 @dataclass(frozen=True)
 class Style:
-    """How C is written.
+    """Names and precision of the C.
 
     Args:
-        name: what the names of its functions, types and macros begin with: an identifier of C.
-        dtype: of all its numbers, float64 or float32.
+        name: the first part of the names of functions, types and macros, an identifier of C.
+        dtype: the type of all numbers, float64 or float32.
     """
 
     name: str = NAME
@@ -44,17 +44,17 @@ class Style:
 
     @property
     def macro(self) -> str:
-        """What its macros begin with."""
+        """The first part of the names of macros."""
         return self.name.upper()
 
     @property
     def real(self) -> str:
-        """The name of the type of its numbers in the header."""
+        """The name of the type of numbers in the header."""
         return f"{self.name}_real"
 
     @property
     def single(self) -> bool:
-        """Whether its numbers are floats."""
+        """Whether the numbers have single precision."""
         return self.dtype == torch.float32
 
     @property
@@ -64,16 +64,16 @@ class Style:
 
     @property
     def numpy(self) -> Any:
-        """NumPy's type of its numbers."""
+        """NumPy's type of the numbers."""
         return np.float32 if self.single else np.float64
 
     def code(self, text: str) -> str:
-        """Code in double precision, in the precision of this style; WIDE is double in each."""
+        """Code in double precision, converted to this style; WIDE becomes double in both precisions."""
         return (in_single_precision(text) if self.single else text).replace("WIDE", "double")
 
 
 class Bits:
-    """What the functions return: 0, or the sum of these, as macros: name ↦ (number, what it says)."""
+    """The return codes of the functions, as macros: each is (number, meaning); functions return a sum of them, or 0."""
 
     NOT_FINITE = 1, "u is not finite; a loop holds the control before it and its last finite estimate"
     OUTSIDE = 2, "x is outside of the states that it was compared on: closed loops from X0, and 20 % around"
@@ -83,7 +83,7 @@ class Bits:
     AT_RANGE_END = 32, "the estimate of a parameter is at an end of its range: the plant may be beyond, with an offset"
 
 
-LOOPS = ("MISSING", "AT_RANGE_END")  # what only a loop with an estimator returns
+LOOPS = ("MISSING", "AT_RANGE_END")  # codes that only a loop with an estimator returns
 
 
 def file_comment(facts: Mapping[str, str]) -> str:
@@ -104,11 +104,11 @@ def sources(
     """File name ↦ text.
 
     Args:
-        facts: what is exported, for the comment at the top.
+        facts: lines for the comment at the top.
         style: names and precision.
-        tried: what it is compared on, beyond which a return code says so.
-        loop: the estimator around the law, as `LoopTraces`; None: the law alone.
-        claim: what is proved of the files, for the comment of the header.
+        tried: the points of the comparison; the functions return a code for states outside of their box.
+        loop: the loop with an estimator, as `LoopTraces`; None: only the law.
+        claim: a claim about the files, for the comment of the header.
 
     Raises:
         ExportError: an operation has no rule in C; or the law is too large for a stack.
@@ -172,7 +172,7 @@ def limits_of(controller: Controller, style: Style) -> tuple[Tensor, Tensor] | N
 
 
 def has_limits(controls: ControlSet, style: Style) -> bool:
-    """Whether u is moved into its limits once more: in single precision a limit is rounded, and may be passed."""
+    """Whether the C clamps u once more: in single precision, u may exceed a limit by rounding."""
     return style.single and isinstance(controls, ControlBox) and controls.fixed_limits is not None
 
 
@@ -199,7 +199,7 @@ FINITE = """static int is_finite(int n, const double *x)
 
 
 def _entries(controller: Controller, law: Law, style: Style, tried: Points) -> str:
-    """The functions that others call, with the boxes that they look at."""
+    """The functions of the header, with the tables of the boxes that they test."""
     n, box, domain = len(law.arguments["x"]), controller.initial_states, controller.problem.domain
     tables = [box_table("known", tried.lower, tried.upper), box_table("start", box.lower[:n], box.upper[:n])]
     given = ", ".join("&t" if argument == "t" else argument for argument in law.arguments)
@@ -249,7 +249,7 @@ def _header(controller: Controller, law: Law, style: Style, loop: Any) -> str:
     )
 
 
-YOURS = ("main.c", "CMakeLists.txt")  # which are left as they are where they exist
+YOURS = ("main.c", "CMakeLists.txt")  # files of the user, which are not replaced
 CMAKE = """cmake_minimum_required(VERSION 3.10)
 project(@ C)
 set(CMAKE_C_STANDARD 99)
@@ -263,11 +263,11 @@ if(CMAKE_SOURCE_DIR STREQUAL CMAKE_CURRENT_SOURCE_DIR)
   add_executable(main main.c)
   target_link_libraries(main @)
 endif()
-"""  # @: the library; as a part of another project it is that alone
+"""  # @ is the name of the library; as part of another project this adds only the library
 
 
 def _example(law: Law, style: Style) -> str:
-    """A program that asks for u and V at a state of X₀."""
+    """A program that prints u and V at a state of X₀."""
     name, macro, real = style.name, style.macro, style.real
     lists = {one: ", ".join(map(literal, law.arguments[one].tolist())) for one in law.arguments if one != "t"}
     arrays = "".join(f"    const {real} {one}[] = {{{numbers}}};\n" for one, numbers in lists.items())
@@ -308,15 +308,15 @@ def library_of(sources: Sequence[Path], options: Sequence[str]) -> ctypes.CDLL:
 
 
 class CompiledLaw:
-    """A controller's law as machine code of this process, for one state at a time: microseconds, not milliseconds.
+    """A controller's law as machine code of this process, for one state at a time, within microseconds.
 
     Args:
-        folder: with the source.
-        law: of which it is.
+        folder: the folder of policy.c.
+        law: the law that policy.c computes.
         controls: m.
-        options: for the compiler.
-        style: as in `sources`.
-        functions: the source, if it is compiled already.
+        options: options of the compiler.
+        style: the names and the precision of policy.c.
+        functions: the compiled policy.c, if it exists already.
 
     Raises:
         ExportError: as compile_c.
@@ -349,13 +349,13 @@ class CompiledLaw:
         return self.policy_and_code(t, x)[0]
 
     def policy_and_code(self, t: float, x: ArrayLike) -> tuple[NDArray, int]:
-        """(u(t, x), what the function returns: 0, or a sum of numbers of Bits) likewise."""
+        """(u(t, x), the return code of the function, 0 or a sum of numbers of Bits); raises as `policy` does."""
         state, u = self._state(x), np.empty(self.controls, self._style.numpy)
         code = self._control(t, *self._places(state), u.ctypes.data)
         return u, code
 
     def value(self, t: float, x: ArrayLike) -> float:
-        """V(t, x) likewise."""
+        """V(t, x); raises as `policy` does."""
         state = self._state(x)
         return self._value(t, *self._places(state))
 
@@ -366,7 +366,7 @@ class CompiledLaw:
         return state
 
     def _places(self, state: NDArray) -> tuple[int, ...]:
-        """Where x, and p, begin."""
+        """The addresses of x and, for a family, of p."""
         start = state.ctypes.data
         return (start, start + state.itemsize * self.states) if self.parameters else (start,)
 

@@ -1,4 +1,4 @@
-"""The whole loop in C99: an estimator and the law at its estimate, y ↦ u, with a step for each Δt."""
+"""The control loop in C99: an estimator and the law at its estimate, y ↦ u, with one step for each Δt."""
 
 import copy
 import ctypes
@@ -25,24 +25,25 @@ from lyapnet.graphs.tracing import core_trace
 from lyapnet.loop.estimation.kalman import Belief
 from lyapnet.task.domain import SLACK
 
-MISSING = 0.05  # share of the readings that are left out where the loop is compared
-ELSEWHERE = 0.05  # share of the steps at which the plant gets another control there
-EXAMPLES = 64  # states of X₀ of which one is the example
-TRUSTED = 3  # standard deviations of the first estimate by which it may be outside of X₀
+MISSING = 0.05  # share of missing readings in the comparison with Python
+ELSEWHERE = 0.05  # share of steps in this comparison at which the plant gets another control
+EXAMPLES = 64  # number of states of X₀ from which the example is chosen
+TRUSTED = 3  # standard deviations by which the first estimate may lie outside of X₀
 
 Traced = dict[str, tuple[str, GraphModule, dict[str, Tensor], list[str]]]
 
 
 class LoopTraces:
-    """The parts of an estimator's loop, traced: predict (x, P, u) ↦ (x', P'), correct (x, P, y) ↦ (x', P');
-    with a delay ahead (x, u) ↦ x'; and take_off (u, x) ↦ u − d̂ within the limits for the law's u, where disturbances d
-    are estimated.
+    """Traces of the parts of a loop with an estimator.
+
+    They are predict (x, P, u) ↦ (x', P') and correct (x, P, y) ↦ (x', P'); with a delay, ahead (x, u) ↦ x'; and with
+    estimated disturbances d̂, take_off (u, x) ↦ u − d̂ within the limits, for the u of the law.
 
     Args:
-        loop: with a Kalman filter that has rules in C: ekf.
+        loop: a loop with an extended Kalman filter (ekf).
 
     Raises:
-        ExportError: another filter; or something that cannot be traced.
+        ExportError: the filter is another one; or a part cannot be traced.
     """
 
     def __init__(self, loop: OutputFeedback):
@@ -99,7 +100,7 @@ class LoopTraces:
         return {"y": readings, **settings, "x̂": ", ".join(system.state_names), "estimator": self.loop.kind, **delay}
 
     def functions(self, tables: Tables) -> tuple[str, int]:
-        """The text of the traced functions, and how many numbers a step has on the stack if they become parts of it."""
+        """(the text of the traced functions, the number of entries of all arrays of a step on the stack)."""
         bodies, total = list[str](), 0
         for name, (heads, graph, arguments, results) in self._parts.items():
             body, size = c_function(f"static void {name}_of({heads})", graph, arguments, results, tables)
@@ -136,7 +137,7 @@ class LoopTraces:
         )
 
     def entries(self, style: Style, tried: Points, law: Law) -> str:
-        """The loop's functions; the law is that of `control_of`."""
+        """The functions of the loop; they call the law as `control_of`."""
         loop, problem = self.loop, self.loop.problem
         n, m, p, macro, name = self.estimated, self.controls, self.readings, style.macro, style.name
         box, domain, known = problem.initial_states, loop.controller.problem.domain, len(tried.lower)
@@ -175,7 +176,7 @@ class LoopTraces:
         return "\n".join([*tables, fill(fill(LOOP))])
 
     def example(self, style: Style) -> str:
-        """A program that gives the loop the same readings for five steps."""
+        """A program that runs five steps of the loop with the same readings."""
         name, macro, real = style.name, style.macro, style.real
         y, settings = numbers_of(self._example_readings(5)), "r, " if self.settings else ""
         r = numbers_of(torch.full((self.settings,), torch.nan))  # they stay as they are
@@ -193,7 +194,7 @@ class LoopTraces:
 
     @torch.no_grad()
     def _example_readings(self, steps: int) -> Tensor:
-        """Readings (p,) of a state of X₀ under which the most controls of some steps are within their limits."""
+        """Readings (p,) of that state of X₀ for which most controls of some steps are inside their limits."""
         loop, problem = copy.copy(self.loop), self.loop.problem
         loop.reset()
         box = problem.initial_states
@@ -205,7 +206,7 @@ class LoopTraces:
         return y[((u > low) & (u < high)).double().mean((0, 2)).argmax()]
 
 
-# Time is double in single precision too: if rounding moved the step at T, the law after T would begin a step later.
+# Time is double also in single precision, as rounding could otherwise let the law after T begin a step later.
 LOOP = """
 /* Take a new estimate if it is finite. */
 static int keep(@NAME_loop *loop, const double *x, const double *P)
@@ -303,9 +304,9 @@ class CompiledLoop:
     """The loop as machine code of this process.
 
     Args:
-        traces: of which it is.
-        functions: the compiled source.
-        style: as in `sources`.
+        traces: the traces of the loop.
+        functions: the compiled policy.c.
+        style: the names and the precision of policy.c.
     """
 
     def __init__(self, traces: LoopTraces, functions: ctypes.CDLL, style: Style):
@@ -331,11 +332,11 @@ class CompiledLoop:
         self.reset()
 
     def reset(self) -> None:
-        """Begin again."""
+        """Restart the loop with its first estimate."""
         self._reset(ctypes.addressof(self.memory))
 
     def step(self, y: NDArray, applied: NDArray | None = None, r: NDArray | None = None) -> NDArray:
-        """u (m,) after readings y (p,), as OutputFeedback.step; r, the settings of a family, NaN to leave them."""
+        """u (m,) after readings y (p,), as OutputFeedback.step; NaN in the settings r of a family keeps them."""
         if applied is not None:
             given = np.ascontiguousarray(applied, self._style.numpy)
             self._applied(ctypes.addressof(self.memory), given.ctypes.data)
@@ -357,21 +358,21 @@ class CompiledLoop:
 
 
 class _Path(NamedTuple):
-    """What a loop in Python read, got instead of its controls, and answered, each (steps, b, …)."""
+    """The inputs and results of a loop in Python, each (steps, b, …)."""
 
-    y: Tensor
-    applied: Tensor  # NaN where the loop's own control acted
-    r: Tensor  # settings of a family; NaN where they stayed
+    y: Tensor  # readings
+    applied: Tensor  # controls that the plant got instead of those of the loop; NaN if it got those
+    r: Tensor  # settings of a family; NaN if they stayed
     u: Tensor
     x_hat: Tensor
     P: Tensor
 
 
 def verify_loop(loop: OutputFeedback, found: CompiledLoop, dtype: torch.dtype) -> LoopAgreement:
-    """Hold an exported loop against Python's: closed loops from X₀ of the model, up to 1.25 T, 10 000 steps in all.
+    """Compare an exported loop with Python's on closed loops from X₀ of the model, up to 1.25 T, 10 000 steps in all.
 
-    Some readings are missing, and at some steps the plant gets another control. Steps at which the loop in Python is
-    no longer finite are left out.
+    Some readings are missing, and at some steps the plant gets another control. Steps from which on the loop in Python
+    is not finite are left out.
 
     Raises:
         ExportError: they differ by more than rounding.
@@ -413,7 +414,7 @@ def _largest(values: NDArray, of_each: bool) -> NDArray:
 @torch.no_grad()
 def _path_of(loop: OutputFeedback) -> _Path:
     """Closed loops of the model with the estimator, from states of X₀."""
-    loop = copy.copy(loop)  # whose estimate stays as it is
+    loop = copy.copy(loop)  # the estimate of the given loop does not change
     loop.reset()
     problem, draw = loop.problem, stream(0, TEST, OUTPUTS)
     steps = min(STATES, max(2, round(AFTER * problem.horizon.steps)))

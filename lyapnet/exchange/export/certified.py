@@ -1,4 +1,4 @@
-"""Files of C that a claim is about: read, compared with what is exported, and what they compute for proofs."""
+"""The C files of an export, read for claims about them: compared with a new export, and traced for proofs."""
 
 import copy
 import hashlib
@@ -22,18 +22,18 @@ from lyapnet.task.sets import ControlBox
 
 FILES = ("policy.h", "policy.c")
 LATEST = 1 - 2.0**-20
-"""Share of T up to which readings are covered: close to T, float32 may take t for T, where another law begins."""
+"""Share of T up to which readings are covered; closer to T, float32 may round t to T, where another law begins."""
 
 
 class CertifiedFiles:
-    """policy.h and policy.c of an export of a controller's law, which are what `export` writes for it.
+    """policy.h and policy.c of an export, which must be equal to those that `export` writes for the controller.
 
     Args:
-        place: their folder, or one of them.
-        checkpoint: that the controller was loaded from.
+        place: their folder, or the path of one of them.
+        checkpoint: the checkpoint of the controller.
 
     Raises:
-        UsageError: they are not, or there are none; the message has the first line that differs.
+        UsageError: they differ, with the first line that does; or there are none.
     """
 
     def __init__(self, controller: Controller, place: str | Path, checkpoint: Path | None = None):
@@ -62,15 +62,15 @@ class CertifiedFiles:
 
     @property
     def sha256(self) -> str:
-        """The digest of both files, each without the comment at its top, which may state a claim about the digest."""
+        """The digest of both files without the comments at their top, which may state a claim with this digest."""
         code = "".join(self._texts[name].partition("*/\n")[2] for name in FILES)
         return hashlib.sha256(code.encode()).hexdigest()
 
     def law(self) -> FloatLaw:
-        """What they compute, for proofs about the controller's closed loop.
+        """The law that the files compute, for proofs about the controller's closed loop.
 
         Raises:
-            UsageError: the controller is in float32, or its limits are not those of each control.
+            UsageError: the controller is in float32, or has limits that are not fixed for each control.
         """
         controller, dtype, policy = self._controller, self._controller.initial_states.lower.dtype, None
         limits, controls = limits_of(controller, self._style), controller.controls
@@ -104,7 +104,7 @@ class CertifiedFiles:
         return self._folder / "policy.h"
 
     def _sources(self, claim: str) -> dict[str, str]:
-        """Both files as they are written for the controller, with the numbers that were measured on the files."""
+        """Both files as `export` writes them for the controller, with the measured differences of the files read."""
         facts, header = facts_of(self._controller, self._checkpoint), self._texts["policy.h"]
         known = _between(header, "   checkpoint: ", "\n")
         if self._checkpoint is not None and known.endswith(f", SHA-256 {digest_of_file(self._checkpoint)}"):

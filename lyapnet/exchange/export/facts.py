@@ -1,4 +1,4 @@
-"""What an export is, in lines for its files: names, units, X₀, limits, target, clock and what follows T."""
+"""Lines that describe an export in its files: names, units, X₀, limits, target, Δt and the law after T."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from lyapnet.value.law_after_horizon import BEYOND
 
 
 def facts_of(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
-    """Key ↦ line; the checkpoint is named without the folders of this machine."""
+    """Key ↦ line; absolute paths of checkpoints are left out."""
     system, problem, T = controller.system, controller.problem, controller.horizon.duration
     constants = sorted(system.constants)
     states = [i for i in range(system.n) if i not in constants]

@@ -1,4 +1,4 @@
-"""A Functional Mock-up Unit for co-simulation, FMI 2.0 or 3.0: the law, or the loop, with its source and a binary."""
+"""A Functional Mock-up Unit for co-simulation (FMI 2.0 or 3.0) of the law or the loop, with source and binary."""
 
 import hashlib
 import platform
@@ -28,19 +28,19 @@ PLATFORMS = {  # (system, machine) ↦ the folder of its binaries in FMI 2.0, in
 
 
 class Variable(NamedTuple):
-    """A number that goes into a unit or comes out of it."""
+    """An input, parameter or output of a unit."""
 
     name: str  # an identifier
-    about: str
+    about: str  # its description
     unit: str
     causality: str  # input, parameter or output
     start: float | None = None
 
 
 def variables_of(controller: Controller, law: Law, loop: LoopTraces | None) -> list[Variable]:
-    """Inputs x, with parameters of a family to be set between steps; or a loop's readings and settings. Outputs u.
+    """Inputs x and, for a family, parameters; or for a loop, its readings and settings as inputs. The outputs are u.
 
-    Their value references are their places in this list, from 1 on; 0 is time, and the last one the code.
+    The value reference of a variable is its position in this list, from 1 on; 0 is time, and the last one is the code.
     """
     system, n = controller.system, len(law.arguments["x"])
     centre, given = controller.initial_states.center.tolist(), list[tuple[str, str, str, float | None]]()
@@ -63,7 +63,7 @@ def variables_of(controller: Controller, law: Law, loop: LoopTraces | None) -> l
 
 
 def _identifier(name: str, otherwise: str, taken: set[str]) -> str:
-    """A name of letters, digits and _ that is not taken yet."""
+    """An identifier made of a name, or `otherwise` if the name begins with no letter, that is not taken yet."""
     short = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     short = short if re.match(r"[A-Za-z]", short) else otherwise
     unique, k = short, 2
@@ -77,19 +77,19 @@ def write_fmu(
     path: Path, version: str, sources: Mapping[str, str], variables: Sequence[Variable], style: Style,
     controller: Controller, looped: bool, settings: int, draft: Path,
 ) -> None:  # fmt: skip
-    """Write a unit: its description, its source, and a binary for this machine where the standard has a place for it.
+    """Write a unit: its description, its source and, on machines in PLATFORMS, a binary.
 
     Args:
         version: one of VERSIONS.
-        sources: policy.h and policy.c.
-        variables: as of variables_of.
+        sources: the texts of policy.h and policy.c.
+        variables: those of variables_of.
         style: the names and the precision of the sources.
         looped: whether the sources have a loop, whose inputs are readings.
-        settings: how many of the last inputs are settings of a family.
+        settings: the number of inputs, the last ones, that are settings of a family.
         draft: an empty folder.
 
     Raises:
-        ExportError: the compiler refuses it.
+        ExportError: the C cannot be compiled.
     """
     text = _adapter(version, variables, style, looped, settings, controller.horizon.dt)
     token = hashlib.sha256((text + sources["policy.c"]).encode()).hexdigest()[:32]
@@ -113,7 +113,7 @@ def write_fmu(
 
 
 def _attributes(**given: object) -> str:
-    """Attributes of XML; those that are None are left out. Characters that XML does not have become blanks."""
+    """Attributes of XML, without those that are None; characters that XML does not allow become blanks."""
     texts = {
         key: re.sub(r"[\x00-\x1f\ufffe\uffff]", " ", str(value)) for key, value in given.items() if value is not None
     }
@@ -212,7 +212,7 @@ def _build_description(name: str) -> str:
 
 
 def _adapter(version: str, variables: Sequence[Variable], style: Style, looped: bool, settings: int, dt: float) -> str:
-    """fmu.c: what the standard asks for, around policy.c."""
+    """fmu.c: the functions of the standard, which call policy.c."""
     given = [each for each in variables if each.causality != "output"]
     inputs = sum(each.causality == "input" for each in given)
     parameter = ", p" if len(given) > inputs else ""
@@ -235,8 +235,8 @@ def _adapter(version: str, variables: Sequence[Variable], style: Style, looped: 
     return re.sub(r"@([A-Z]+)", lambda word: str(words.get(word[1], word[0])), text)
 
 
-# u is that of the inputs which were set before a step, from the beginning of that step on. Before the first step it is
-# computed from the inputs at the start, without a change of the loop.
+# During a step, u follows from the inputs that were set before it. Before the first step, u is computed from the inputs
+# at the start, and the loop does not change.
 UNIT = """/* A unit of the Functional Mock-up Interface around policy.c. */
 #include <stdlib.h>
 #include <string.h>

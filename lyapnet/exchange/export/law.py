@@ -1,4 +1,4 @@
-"""u(t, x) and V(t, x) of one state as functions to be traced: limits, target, parameters and clock are inside."""
+"""u(t, x) and V(t, x) of one state as traced functions, with limits, target, parameters and the law after T."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -14,14 +14,14 @@ from lyapnet.graphs.tracing import core_trace
 
 
 class Law:
-    """A controller's law, traced: functions of t (), x (n,) and, of a family, p (k,); t below 0 counts as 0.
+    """A controller's law as traces of functions of t (), x (n,) and, for a family, p (k,); t below 0 counts as 0.
 
     Args:
-        controller: whose law it is.
-        dtype: precision in which it will be computed; None: that of the controller.
+        controller: the controller.
+        dtype: the precision in which the law will be computed; None: that of the controller.
 
     Raises:
-        ExportError: the law after T is an error; or, where a trace is asked for, it cannot be made.
+        ExportError: there is no law after T (beyond=error). The properties raise it if the law cannot be traced.
     """
 
     def __init__(self, controller: Controller, dtype: torch.dtype | None = None):
@@ -40,31 +40,31 @@ class Law:
         self.arguments = {"t": torch.zeros_like(example[0]), "x": x, **({"p": p} if constants else {})}
 
     def given(self, t: Any, state: Any) -> list[Any]:
-        """The arguments of t and a state (…, n + k), an array or a tensor."""
+        """The arguments [t, x] or [t, x, p] for t and a state (…, n + k), as arrays or tensors."""
         n = len(self.arguments["x"])
         return [t, state[..., :n], state[..., n:]][: len(self.arguments)]
 
     @cached_property
     def control(self) -> GraphModule:
-        """(u (m,),)"""
+        """The trace of (u,), (m,)."""
         return self._traced(lambda t, x: (self._applied(t, x),))
 
     @cached_property
     def value(self) -> GraphModule:
-        """(V (),)"""
+        """The trace of (V,), ()."""
         return self._traced(lambda t, x: (self._continued.V.at_any_time(t, x)[0],))
 
     @cached_property
     def both(self) -> GraphModule:
-        """(u, V)"""
+        """The trace of (u, V)."""
         return self._traced(lambda t, x: (self._applied(t, x), self._continued.V.at_any_time(t, x)[0]))
 
     def control_beside(self, policy: Callable[[Tensor, Tensor], Tensor]) -> GraphModule:
-        """(u, policy(t, x)), (m,) each, in one graph."""
+        """The trace of (u, policy(t, x)), (m,) each."""
         return self._traced(lambda t, x: (self._applied(t, x), policy(t, x)[0]))
 
     def _applied(self, t: Tensor, x: Tensor) -> Tensor:
-        """u (m,) of a batch of one state."""
+        """u, (m,), for x of shape (1, n + k)."""
         return self._controls.applied(x, self._continued.at_any_time(t, x))[0]
 
     def _traced(self, function: Callable[[Tensor, Tensor], tuple[Tensor, ...]]) -> GraphModule:

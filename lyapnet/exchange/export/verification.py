@@ -1,4 +1,4 @@
-"""What was written, held against the controller on many states."""
+"""Compares an export with its controller at many states."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,19 +14,21 @@ from lyapnet.controller.controller import Controller
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 from lyapnet.value.policy import LookaheadPolicy
 
-STATES = 10_000
-LOOPS = 100  # closed loops, of whose states half of them are
-AROUND = 0.2  # of the widths of the box of those states, by which the others may leave it
-AFTER = 1.25  # of T: their latest time
-TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # relative to the largest |u| and |V|
-LOOSER = 1e3  # for a law that compares costs: rounding decides between controls that cost the same
-MOST = 0.05  # tolerance that no law and no precision may pass
+STATES = 10_000  # number of states for the comparison
+LOOPS = 100  # number of closed loops on which half of these states are
+AROUND = 0.2  # margin of the box of the other states around those of closed loops, relative to its widths
+AFTER = 1.25  # latest time of the other states, relative to T
+TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # largest difference, relative to the largest |u| and |V|
+COMPARED_COSTS_FACTOR = (
+    1e3  # factor of the tolerance for laws that compare costs, as rounding decides between equal costs
+)
+LARGEST_TOLERANCE = 0.05  # largest tolerance of all laws and precisions
 
 Evaluate = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]  # t (k,), x (k, n) ↦ u (k, m), V (k,)
 
 
 class Points(NamedTuple):
-    """What exports are held against: times, states, and the box that these states are in."""
+    """The times and states at which exports are compared, and the box that contains the states."""
 
     t: Tensor  # (k,)
     x: Tensor  # (k, n)
@@ -55,7 +57,7 @@ class Agreement(NamedTuple):
     states: int
     control: float  # of |u − u'|, relative to the largest |u|
     value: float  # of |V − V'|, relative to the largest |V|
-    loop: LoopAgreement | None = None  # of the loop with an estimator, where that was exported too
+    loop: LoopAgreement | None = None  # those of the loop with an estimator, if it was exported too
 
     def __str__(self) -> str:
         law = (
@@ -68,10 +70,10 @@ class Agreement(NamedTuple):
 def verify(
     controller: Controller, evaluate: Evaluate, tried: Points | None = None, dtype: torch.dtype = torch.float64
 ) -> Agreement:
-    """Hold an export against its controller: on states of closed loops, and around them, up to and after T.
+    """Compare an export with its controller at states of closed loops and around them, up to T and after it.
 
     Args:
-        tried: `points` of the controller, if they are known.
+        tried: `points` of the controller, if they exist already.
         dtype: the precision of the export.
 
     Raises:
@@ -93,13 +95,13 @@ def verify(
 
 
 def tolerance_of(law: ContinuedPolicy, *precisions: torch.dtype) -> float:
-    """The largest relative difference from a law that counts as rounding, in the coarsest of some precisions."""
-    looser = LOOSER if isinstance(law.policy, LookaheadPolicy) else 1
-    return min(MOST, looser * max(TOLERANCES[each] for each in precisions))
+    """The largest relative difference from a law that counts as rounding, for the coarsest of some precisions."""
+    looser = COMPARED_COSTS_FACTOR if isinstance(law.policy, LookaheadPolicy) else 1
+    return min(LARGEST_TOLERANCE, looser * max(TOLERANCES[each] for each in precisions))
 
 
 def points(controller: Controller) -> Points:
-    """The states that exports are held against: half of them of closed loops, the others around these."""
+    """The states at which exports are compared: half of them on closed loops, the others around these."""
     generator = stream(0, TEST, 1)
     x0 = controller.initial_states.sample(LOOPS, generator).to(controller.initial_states.lower)
     loops = controller.rollout(x0)
@@ -109,7 +111,7 @@ def points(controller: Controller) -> Points:
     lower, upper = visited.amin(0), visited.amax(0)
     share = torch.rand(STATES - len(chosen), x0.shape[-1], generator=generator, dtype=torch.float64).to(x0)
     low, high = lower - AROUND * (upper - lower), upper + AROUND * (upper - lower)
-    constants = list(controller.system.constants)  # what V was told of
+    constants = list(controller.system.constants)  # V was trained for parameters of X₀ only
     low[constants] = controller.initial_states.lower[constants]
     high[constants] = controller.initial_states.upper[constants]
     around = (lower + (upper - lower) * ((1 + 2 * AROUND) * share - AROUND)).clamp(low, high)
@@ -119,7 +121,7 @@ def points(controller: Controller) -> Points:
 
 
 def _difference(own: Tensor, other: NDArray) -> float:
-    """The largest difference, relative to the largest entry; infinite where one has no number and the other has."""
+    """The largest difference, relative to the largest entry; ∞ if one is finite where the other is not."""
     expected, found = own.double().cpu().numpy(), np.asarray(other, dtype=np.float64).reshape(own.shape)
     if not np.array_equal(np.isfinite(expected), np.isfinite(found)):
         return float("inf")

@@ -1,4 +1,4 @@
-"""Writing a controller's law: traced, written, held against the controller, and only then kept."""
+"""Exports a controller's law: traces it, writes it, compares it with the controller, and keeps it if they agree."""
 
 import re
 import tempfile
@@ -18,26 +18,20 @@ from lyapnet.exchange.export.facts import facts_of
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Agreement, points, verify
 
-FORMATS = {
-    "c": "",
-    "fmu": ".fmu",
-    "onnx": ".onnx",
-    "torch": ".pt2",
-    "casadi": ".casadi",
-}  # ↦ how a file's name ends; c is a folder
+FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2", "casadi": ".casadi"}
+"""Format ↦ the ending of its file; c is a folder."""
 IN_C = ("c", "fmu")
 PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
     "casadi": (programs.casadi_function_of, programs.write_casadi, programs.run_casadi),
 }
-
-
+"""Format ↦ (law ↦ program, the function that writes a program, the function that runs a file)."""
 DTYPES = {"float64": torch.float64, "float32": torch.float32}  # of the numbers in C
 
 
 class Exported(NamedTuple):
-    """What was written, and how far it is from the controller."""
+    """The files of an export, and the differences from the controller."""
 
     paths: list[Path]
     agreement: Agreement
@@ -54,24 +48,24 @@ def export(
 ) -> Exported:
     """Write u(t, x) and V(t, x) of a controller for use without lyapnet; in C also its loop with an estimator.
 
-    Limits, target, parameters of a family and what follows T are inside; t below 0 counts as 0. What is written is run
-    on 10 000 states and held against the controller, a loop over 10 000 steps; where they differ by more than rounding,
+    The export includes limits, target, parameters of a family and the law after T; t below 0 counts as 0. It is run on
+    10 000 states, a loop over 10 000 steps, and compared with the controller. If they differ by more than rounding,
     nothing is kept.
 
     Args:
-        exported: a controller; or a controller with its estimator, of controller.with_estimator("ekf").
-        path: of a folder for c, of a file for the others.
+        exported: a controller; or a controller with an estimator, from controller.with_estimator("ekf").
+        path: a folder for c, a file for the other formats.
         to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; onnx, a model
             (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load; casadi, a function with V_x too,
             for casadi.Function.load.
-        checkpoint: that the controller was loaded from, whose digest is then noted.
-        name: what the names in C begin with: several laws in one program need several.
-        dtype: of the numbers in C, float64 or float32.
+        checkpoint: the checkpoint of the controller, for its digest in the files.
+        name: the first part of all names in C, so that several laws fit into one program.
+        dtype: float64 or float32, the type of the numbers in C.
         fmi: the version of a unit's interface, 2.0 or 3.0.
 
     Raises:
-        UsageError: another format, dtype or version, a place that cannot be written to, or a name that is none in C.
-        ExportError: the law cannot be written in it, or what was written is not that law.
+        UsageError: the format, dtype or version is unknown, the path cannot be written, or the name is no name in C.
+        ExportError: the law cannot be written in this format, or the export differs from it.
     """
     path = Path(path)
     _require_place(path, to)
@@ -112,7 +106,7 @@ def export(
 def compiled(controller: Controller) -> c.CompiledLaw:
     """A controller's law as machine code of this process, for a loop in Python: `.policy(t, x)` and `.value(t, x)`.
 
-    It takes one state at a time. It is what `export` writes in C, held against the controller likewise.
+    It takes one state at a time. It is the C that `export` writes, compared with the controller in the same way.
 
     Raises:
         ExportError: as export.
@@ -122,12 +116,12 @@ def compiled(controller: Controller) -> c.CompiledLaw:
 
 
 class Written:
-    """The C of a controller, and of a loop if there is one: text, and how far it is from the controller.
+    """The C of a controller, with its loop if there is one: its text, and its differences from the controller.
 
     Args:
-        facts: what it is, in lines.
+        facts: lines for the comment at the top of the files.
         style: names and precision.
-        loop: the estimator around the law, if it is written too.
+        loop: the loop with an estimator, if it is exported too.
     """
 
     def __init__(
@@ -139,12 +133,17 @@ class Written:
         self.tried = points(controller)
 
     def sources(self, claim: str = "", **more: str) -> dict[str, str]:
-        """File name ↦ text, with further facts, and a claim about the files in the header."""
+        """File name ↦ text.
+
+        Args:
+            claim: a claim about the files, for the header.
+            more: further lines for the comment at the top.
+        """
         facts = {**self.facts, **more}
         return c.sources(self.controller, self.law, facts, self.style, self.tried, self.traces, claim)
 
     def verified(self, folder: Path, options: Sequence[str]) -> tuple[c.CompiledLaw, Agreement]:
-        """The C written into a folder, compiled, and held against the controller."""
+        """Write the C into a folder, compile it and compare it with the controller; (the law, the differences)."""
         for file, text in self.sources().items():
             (folder / file).write_text(text, encoding="utf-8")
         functions = c.library_of([folder / "policy.c"], options)
@@ -157,7 +156,7 @@ class Written:
 
 
 def _require_name(name: str, to: str, path: Path) -> None:
-    """Refuse what cannot begin a name in C, a name where there are none, and another one than an earlier export's."""
+    """Refuse a name that is none in C, a name for a format without names, and another name than in the same folder."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
     if to not in IN_C and name != c.NAME:
@@ -171,7 +170,7 @@ def _require_name(name: str, to: str, path: Path) -> None:
 
 
 def _require_dtype(dtype: str, to: str) -> None:
-    """Refuse another precision, and a choice where there is none."""
+    """Refuse an unknown dtype, and float32 for formats that have the precision of the controller."""
     if dtype not in DTYPES:
         raise UsageError(f"Expected a dtype among {', '.join(DTYPES)}, got {dtype!r}; choose one of them.")
     if to not in IN_C and dtype != "float64":
@@ -179,7 +178,7 @@ def _require_dtype(dtype: str, to: str) -> None:
 
 
 def _require_place(path: Path, to: str) -> None:
-    """Refuse another format, and a place where something else stands."""
+    """Refuse an unknown format, and a path at which there is something other than an earlier export."""
     if to not in FORMATS:
         raise UsageError(f"Expected a format among {', '.join(FORMATS)}, got {to!r}; choose one of them.")
     if not path.parent.is_dir():
@@ -200,7 +199,7 @@ def _require_place(path: Path, to: str) -> None:
 
 
 def _write_c(written: Written, draft: Path, folder: Path) -> Exported:
-    """The files of a C library; in a folder that has them, those of the law alone."""
+    """Write the files of a C library; in the folder of an earlier export, only those of the law."""
     _, agreement = written.verified(draft, c.FLAGS)
     folder.mkdir(exist_ok=True)
     paths = []
@@ -212,7 +211,7 @@ def _write_c(written: Written, draft: Path, folder: Path) -> Exported:
 
 
 def _write_fmu(written: Written, draft: Path, path: Path, version: str) -> Exported:
-    """A unit for co-simulation."""
+    """Write a unit for co-simulation."""
     _, agreement = written.verified(draft, c.FLAGS)
     variables = fmu.variables_of(written.controller, written.law, written.traces)
     sources, file = written.sources(verified=str(agreement)), draft / path.name

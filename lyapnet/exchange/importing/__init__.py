@@ -1,4 +1,4 @@
-"""V(x) and u(x) that were made elsewhere, as functions in Python or ONNX files, for the certificates."""
+"""V(x) and u(x) of other tools, as functions in Python or ONNX files, for certificates."""
 
 from lyapnet.exchange.importing.files import imported_controller
 from lyapnet.exchange.importing.law import GivenLaw, GivenValue, controller_of

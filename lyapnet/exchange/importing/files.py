@@ -1,4 +1,4 @@
-"""A controller of V(x) and u(x) in ONNX files, and of a config that says what they are about."""
+"""A controller of V(x) and u(x) in ONNX files, on the task of a config."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,8 +18,9 @@ from lyapnet.experiment.config import Config, config_from_plain
 from lyapnet.experiment.schema import read_yaml
 from lyapnet.task.problem import Problem
 
-COUNTS_NOT = {"cost": {"Q": 0, "R": 1, "Q_T": 0}, "horizon": {"steps": 1000, "dt": 0.01}}  # in a config for this
-CORNERS = 6  # axes at whose ends corners are tried
+DEFAULT_SECTIONS = {"cost": {"Q": 0, "R": 1, "Q_T": 0}, "horizon": {"steps": 1000, "dt": 0.01}}
+"""Values of sections that a config for imported functions may leave out, since only training needs them."""
+CORNERS = 6  # largest number of axes at whose corners functions are tested
 SCALES = 10.0 ** -torch.arange(46, dtype=torch.float64)  # down to 1e-45, the smallest number of float32
 
 
@@ -29,27 +30,27 @@ def imported_controller(
     law: str | Path | nn.Module,
     own: Mapping[str, str] | None = None,
 ) -> Controller:
-    """The controller of V(x) and u(x) that were made elsewhere, on the task of a config.
+    """The controller of V(x) and u(x) of other tools, on the task of a config.
 
-    Nothing in a file is run; each is held against onnxruntime.
+    No code of a file is run; each file is compared with onnxruntime.
 
     Args:
-        config: a YAML file with `system`, `initial_states` and, where there are limits, `controls`; the cost counts
-            only with the goal that it is about, and the horizon only as the unit of the default λ.
-        value, law: ONNX files of one input x and one output, V or u; or functions, as of controller_of.
-        own: the user's own parts as module:Class, in the place of those of the config.
+        config: a YAML file with `system`, `initial_states` and, for limits, `controls`. Of the cost, only the goal is
+            used, and of the horizon, only T in the default of λ.
+        value, law: ONNX files with one input x and one output, V or u; or functions, as in controller_of.
+        own: the user's own parts as module:Class, which replace those of the config.
 
     Raises:
-        UsageError: a file is missing or holds something else.
+        UsageError: a file is missing or has another content.
     """
     resolved = _config_of(Path(config))
     problem = build_problem(resolved, parts_named(resolved, {**own_parts(resolved), **(own or {})}))
     require_one_system(problem)
-    (v, told_v, name_v), (k, told_k, name_k) = _function(value, problem, rounds=False), _function(law, problem)
+    (v, origin_v, name_v), (k, origin_k, name_k) = _function(value, problem, rounds=False), _function(law, problem)
     precision = k.precision if isinstance(k, OnnxFunction) else None
     computed = "real numbers too" if precision is None else f"{precision}, which rounds each operation and x itself"
     origin = (
-        f"those of {told_v}, and of {told_k}, read as functions of one state; V is read in real numbers, and u in "
+        f"those of {origin_v}, and of {origin_k}, read as functions of one state; V is read in real numbers, and u in "
         f"{computed}"
     )
     about = replace(
@@ -61,10 +62,10 @@ def imported_controller(
 
 
 def _function(given: str | Path | nn.Module, problem: Problem, rounds: bool = True) -> tuple[nn.Module, str, str]:
-    """The function of a file, held against onnxruntime, or one from Python; what there is to say of it; its name.
+    """(the function of a file or from Python, its origin in words, its name); a file is compared with onnxruntime.
 
     Args:
-        rounds: whether it is run, and so rounds; V is a function of real numbers, which nothing runs.
+        rounds: whether bounds include rounding, as for u, which runs; V is a function of real numbers.
     """
     if isinstance(given, nn.Module):
         name = type(given).__name__
@@ -80,7 +81,7 @@ def _function(given: str | Path | nn.Module, problem: Problem, rounds: bool = Tr
 
 
 def _extreme_states(problem: Problem) -> State:
-    """The goal, corners of X₀ and of the wide box, and states ever closer to the goal, down to nothing in float32."""
+    """The goal, corners of X₀ and of the wide box, and states closer and closer to the goal, down to 0 in float32."""
     goal, box = problem.goal.double(), problem.initial_states
     corners = torch.cat([goal + scale * (box.corners(CORNERS).double() - goal) for scale in (1, 3)])
     x = states_around(problem)[: len(SCALES)]
@@ -88,9 +89,9 @@ def _extreme_states(problem: Problem) -> State:
 
 
 def _config_of(path: Path) -> Config:
-    """The config of a file that need not say what only training needs."""
+    """The config of a file, which may leave out the sections in DEFAULT_SECTIONS."""
     content: dict[str, Any] = read_yaml(path, Config)
-    for name, section in COUNTS_NOT.items():
+    for name, section in DEFAULT_SECTIONS.items():
         given = content.get(name)
         if given is None or (isinstance(given, Mapping) and "name" not in given):
             content[name] = {**section, **(given or {})}

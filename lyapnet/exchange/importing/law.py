@@ -1,4 +1,4 @@
-"""A V(x) and a law u(x) that were made elsewhere, as a controller."""
+"""V(x) and a law u(x) of other tools as a controller."""
 
 import copy
 import logging
@@ -20,13 +20,13 @@ from lyapnet.task.problem import TRIED, Problem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import ValuePolicy
 
-STATES = 1000  # at which functions of others are tried
+STATES = 1000  # number of states at which V(x) and u(x) are tested
 IN_PYTHON = "functions from Python, read in real numbers"
-LEAVES = 1e-6  # of the largest |u|, by which it may be outside of U: rounding in float32
+LEAVES = 1e-6  # largest distance of u from U that counts as rounding in float32, relative to the largest |u|
 
 
 class GivenValue(ValueFunction):
-    """V(t, x) = v(x) − v(x*), the same at every t.
+    """V(t, x) = v(x) − v(x*) for every t.
 
     Args:
         function: v, (k, n) ↦ (k,) or (k, 1).
@@ -49,12 +49,12 @@ class GivenValue(ValueFunction):
 
 
 class GivenLaw(ValuePolicy):
-    """u(t, x) = the point of U closest to k(x), at every t; V stands beside it, and does not define it.
+    """u(t, x) = the point of U closest to k(x), for every t; it does not depend on V.
 
     Args:
-        function: k, (k, n) ↦ (k, m).
+        function: k, (batch, n) ↦ (batch, m).
         origin: where v and k come from, in words.
-        precision: of the arithmetic in which k is computed, whose rounding its bounds count; None for real numbers.
+        precision: the number type in which k is computed, whose rounding its bounds include; None for real numbers.
     """
 
     def __init__(
@@ -85,20 +85,20 @@ def controller_of(
     config: Config | None = None,
     precision: str | None = None,
 ) -> Controller:
-    """A controller of V(x) and u(x) that were made elsewhere, for `certify region` and its like.
+    """A controller of V(x) and u(x) of other tools, for certificates such as `certify region`.
 
-    Copies in float64 are taken, of the weights as they are: later training does not change them.
+    It has copies of both in float64, which later training does not change.
 
     Args:
-        problem: of which system, X₀, goal and controls count; u(x) is clamped to U, and V is counted from V(x*).
-        value: (k, n) ↦ (k,) or (k, 1).
-        law: (k, n) ↦ (k, m).
-        origin: where both come from, as a certificate says it.
-        config: that the problem comes from, for reports.
-        precision: of GivenLaw.
+        problem: its system, X₀, goal and controls are used; u(x) is clamped to U, and V(x*) is subtracted from V.
+        value: V, (k, n) ↦ (k,) or (k, 1).
+        law: u, (k, n) ↦ (k, m).
+        origin: where both come from, in words for certificates.
+        config: the config of the problem, for reports.
+        precision: as in GivenLaw.
 
     Raises:
-        UsageError: it is about a family, or V or u has another shape.
+        UsageError: the system is a family, or V or u has another shape.
     """
     require_one_system(problem)
     if isinstance(problem.controls, MappedControls):
@@ -124,14 +124,14 @@ def require_one_system(problem: Problem) -> None:
 
 
 def states_around(problem: Problem) -> State:
-    """States at which functions of others are tried: half of them of X₀, half of a box three times as wide."""
+    """States at which V(x) and u(x) are tested: half of them in X₀, half in a box three times as wide."""
     box, generator = problem.initial_states, stream(0, TEST, 2)
     near, wide = (box.sample(STATES // 2, generator).double() for _ in range(2))
     return torch.cat([near, box.center + 3 * (wide - box.center)])
 
 
 def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
-    """Log a note where u(x) is not in U."""
+    """Log a note if u(x) is not in U at some state."""
     x = states_around(problem)
     with torch.no_grad():
         u = policy.unlimited(x)
@@ -145,7 +145,7 @@ def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
 
 
 def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
-    """Refuse a function that remembers something, or is another one in batches of another size."""
+    """Refuse a function that remembers calls, or whose results depend on the size of the batch."""
     x, ends = states_around(problem)[:TRIED], problem.initial_states.ends(TRIED).double()
 
     def call(x: State) -> None:
@@ -158,7 +158,7 @@ def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
 
 
 def _require_size(name: str, function: nn.Module, goal: State, size: int) -> None:
-    """Refuse a function that does not give so many finite numbers at x*."""
+    """Refuse a function that does not return `size` finite numbers at x*."""
     with torch.no_grad():
         found = called(name, function, [goal[None]])
     if not isinstance(found, Tensor) or found.numel() != size:

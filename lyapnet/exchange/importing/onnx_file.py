@@ -1,4 +1,4 @@
-"""ONNX files: what they hold, and what onnxruntime makes of it."""
+"""ONNX files: their models, and a comparison of our results with those of onnxruntime."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,20 +14,20 @@ from lyapnet.base.types import State
 from lyapnet.exchange.importing.onnx_function import DOMAIN, INPUTS, OnnxFunction, library
 from lyapnet.prover.bounds import BoundedFunction
 
-OPSET = 18  # whose semantics OPERATORS have; older files are converted to it
-CHUNK = 64  # states that are computed together
+OPSET = 18  # the version of ONNX's operators that OPERATORS implement; older files are converted to it
+CHUNK = 64  # number of states that are computed together
 
 
 class OnnxModel(NamedTuple):
-    """An ONNX model whose weights are all in it, and the files that it was read from."""
+    """An ONNX model with all its weights, and the files from which it was read."""
 
-    proto: Any
-    digests: dict[str, str]  # name ↦ SHA-256
-    written: Any  # the model as it is in the file, which onnxruntime runs
+    proto: Any  # the model with the operators of OPSET
+    digests: dict[str, str]  # name of a file ↦ SHA-256
+    written: Any  # the model as the file has it, for onnxruntime
 
 
 def read_onnx(path: Path) -> OnnxModel:
-    """The model of an ONNX file, with weights beside it that it names, in the semantics of OPSET; nothing is run.
+    """The model of an ONNX file, with the weights in files that it names, and operators of OPSET; nothing is run.
 
     Raises:
         UsageError: no such file, not ONNX, or onnx is missing.
@@ -48,7 +48,7 @@ def read_onnx(path: Path) -> OnnxModel:
         raise UsageError(
             f"Expected an ONNX file, got {str(path)!r} ({error.strerror or error}); export it first."
         ) from error
-    except Exception as error:  # of many kinds, with nothing in common
+    except Exception as error:  # onnx raises many kinds
         advice = "export it with torch.onnx.export, or its like"
         if path.suffix in (".pt", ".pt2", ".pth", ".ckpt"):
             advice = "reading a torch file can run code that it holds: export it with torch.onnx.export"
@@ -57,8 +57,8 @@ def read_onnx(path: Path) -> OnnxModel:
 
 
 def _tensors_of(graph: Any) -> Iterator[Any]:
-    """All tensors of a graph or function, which may lie beside the file: constants, and what nodes hold."""
-    yield from getattr(graph, "initializer", ())  # a function has none
+    """All tensors of a graph or function whose data may be in another file: constants and attributes of nodes."""
+    yield from getattr(graph, "initializer", ())  # functions have no initializer
     for attribute in (each for node in graph.node for each in node.attribute):
         yield from (attribute.t, *attribute.tensors)
         for inner in (attribute.g, *attribute.graphs):
@@ -66,13 +66,13 @@ def _tensors_of(graph: Any) -> Iterator[Any]:
 
 
 def _modern(model: Any, path: Path) -> Any:
-    """A model without functions of its own, in the semantics of OPSET."""
+    """The model without functions of its own, with the operators of OPSET."""
     inliner, converter = (library(f"onnx.{name}") for name in ("inliner", "version_converter"))
     try:
         model = inliner.inline_local_functions(model)
         version = max((each.version for each in model.opset_import if each.domain in DOMAIN), default=0)
         return converter.convert_version(model, OPSET) if version < OPSET else model
-    except Exception as error:  # of many kinds
+    except Exception as error:  # torch and onnx raise many kinds
         raise UsageError(
             f"Expected operators that can be converted to opset {OPSET} in {str(path)!r}, got "
             f"{one_line(error)[:150]}; export it for that opset."
@@ -80,13 +80,14 @@ def _modern(model: Any, path: Path) -> Any:
 
 
 def require_same(function: OnnxFunction, model: Any, states: State) -> float:
-    """The largest difference from what onnxruntime makes of a model, state by state, relative to the largest result.
+    """The largest difference of a function from onnxruntime's results, relative to the largest result.
 
     Args:
-        function: with rounding: at each state onnxruntime's result lies within its bounds.
+        function: the function, with rounding.
+        model: the model that onnxruntime runs, one state at a time.
 
     Raises:
-        UsageError: it does not; or onnxruntime does not run it.
+        UsageError: at some state onnxruntime's result lies outside of the bounds of the function; or it does not run.
     """
     levels = library("onnxruntime").GraphOptimizationLevel
     others = [_computed(model, function, states, level) for level in (levels.ORT_DISABLE_ALL, levels.ORT_ENABLE_ALL)]
@@ -112,24 +113,24 @@ def require_same(function: OnnxFunction, model: Any, states: State) -> float:
 
 
 def _computed(model: Any, function: OnnxFunction, states: State, level: Any) -> np.ndarray:
-    """What onnxruntime makes of states, one by one, with some of its optimisations of a graph."""
+    """The results of onnxruntime at states, one by one, with graph optimisations of some level."""
     runtime = library("onnxruntime")
     try:
         options = runtime.SessionOptions()
         options.graph_optimization_level = level
         session = runtime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
-        with np.errstate(over="ignore"):  # beyond float32 all is infinite
+        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite
             given = states.numpy().astype(INPUTS[function.kind])
         rows = [session.run(None, {function.input: x[None] if function.batched else x})[0].ravel() for x in given]
         return np.stack(rows).astype(np.float64)
-    except Exception as error:  # of many kinds
+    except Exception as error:  # torch and onnx raise many kinds
         raise UsageError(
             f"Expected a file that onnxruntime runs, got {function.name!r}: {one_line(error)[:200]}; export it again."
         ) from error
 
 
 def bounds_at(function: OnnxFunction, states: State) -> tuple[Tensor, Tensor]:
-    """(lower, upper) bounds of a function at each of some states, which its rounding parts."""
+    """(lower, upper) bounds of a function at each of some states; they differ by its rounding."""
     at = torch.cat([torch.zeros(len(states), 1, dtype=torch.float64), states], 1)
     bounded = BoundedFunction(lambda t, x: (function(x[None])[0],), (at.amin(0), at.amax(0)), degree=1)
     bounds = [bounded.bounds(some, some)[0] for some in at.split(CHUNK)]

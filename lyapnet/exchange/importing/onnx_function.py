@@ -1,4 +1,4 @@
-"""A function that an ONNX model holds, as torch operations in float64."""
+"""The function of an ONNX model as torch operations in float64."""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -26,8 +26,9 @@ from lyapnet.exchange.importing.operators import OPERATORS, OnnxOperator
 
 DOMAIN = ("", "ai.onnx")
 INPUTS = {FLOAT: np.float32, DOUBLE: np.float64}
-MOST, MOST_OF_ONE, MOST_INDICES = 50_000_000, 50_000, 10_000  # numbers of all constants, of one that moves, of a list
-MOST_NODES = 10_000
+# largest numbers of entries: of all constants together, of a value that depends on x, and of a list of indices
+MOST, MOST_OF_ONE, MOST_INDICES = 50_000_000, 50_000, 10_000
+MOST_NODES = 10_000  # largest number of nodes of a graph
 TRUTHS = ("Less", "LessOrEqual", "Greater", "GreaterOrEqual", "Equal", "Not", "And", "Or")
 
 
@@ -38,20 +39,20 @@ class Moving(NamedTuple):
 
 
 class Weight(NamedTuple):
-    """The place of a constant tensor among the weights."""
+    """The index of a constant tensor among the weights."""
 
     index: int
 
 
 class Step(NamedTuple):
-    """One node that depends on x, or rounds."""
+    """A node that depends on x, or rounds."""
 
     operator: str
-    arguments: list[Any]  # each Moving, a Weight, or anything else as it is
+    arguments: list[Any]  # each a Moving, a Weight, or a plain value
     attributes: dict[str, Any]
-    results: list[str]
+    results: list[str]  # their names
     kind: int  # type of the results
-    weight: float  # of Numbers
+    weight: float  # as in Numbers
 
     @property
     def moving(self) -> list[bool]:
@@ -60,24 +61,22 @@ class Step(NamedTuple):
 
 
 class OnnxFunction(nn.Module):
-    """x (k, n) ↦ y (k, …): what the file says of one state at a time, in real numbers.
+    """x (k, n) ↦ y (k, …), the function of the model for one state at a time, in real numbers.
 
-    Weights are the numbers that the file holds, as float64; what they are combined to is computed in float64 too. All
-    that does not depend on x is computed once. Bounds of a function that rounds hold for what onnxruntime computes,
-    operation by operation in the type that each has in the file.
+    Weights are the numbers of the file as float64. Values that do not depend on x are computed once, in float64. If the
+    function rounds, its bounds hold for the results of onnxruntime, with each operation in its type in the file.
 
     Args:
         model: an onnx.ModelProto with one input x of shape (n,), or (batch, n) with a batch that is free or 1.
-        n: states.
-        name: of the file, for messages.
-        rounds: whether its bounds count the rounding of the file's types, that of x to the type of the input included.
+        n: the number of states.
+        name: the name of the file, for messages.
+        rounds: whether bounds include the rounding of the types in the file, also of x to the type of the input.
 
     Attributes:
         precision: the types in which it computes.
 
     Raises:
-        UsageError: it is no such model, has an operator or a type that is not known here, or whole numbers that leave
-            their type.
+        UsageError: the model has other inputs, an unknown operator or type, or whole numbers that leave their type.
     """
 
     def __init__(self, model: Any, n: int, name: str, rounds: bool = False):
@@ -91,7 +90,7 @@ class OnnxFunction(nn.Module):
         self.precision = " and ".join(NAMES[kind] for kind in sorted(kinds & NAMES.keys()))
 
     def forward(self, x: State) -> Tensor:
-        is_one = isinstance(x.shape[0], int) and len(x) == 1  # a size without a value stands for many
+        is_one = isinstance(x.shape[0], int) and len(x) == 1  # sizes without a value (in traces) stand for many
         return self._of_one(x[0])[None] if is_one else torch.vmap(self._of_one)(x)
 
     def _of_one(self, x: State) -> Tensor:
@@ -116,7 +115,7 @@ class OnnxFunction(nn.Module):
         return self.weights[argument.index] if isinstance(argument, Weight) else argument
 
     def _unfold(self, graph: Any, x: Tensor) -> None:
-        """Compute what is constant, and list the steps of what is not, by their results at one x."""
+        """Compute the constants, and list the steps that depend on x; their sizes are found with an example x."""
         constants = {each.name: self._tensor(each) for each in graph.initializer}
         self._kinds |= {each.name: each.data_type for each in graph.initializer}
         moving = {self.input: x}
@@ -164,7 +163,7 @@ class OnnxFunction(nn.Module):
         self, node: Any, operator: OnnxOperator, kind: int, names: Sequence[str], moving: Mapping[str, Tensor],
         results: Mapping[str, Tensor],
     ) -> bool:  # fmt: skip
-        """Whether a result depends on x, or on how constants are rounded."""
+        """Whether the results of a node depend on x, or on the rounding of constants."""
         if any(each in moving for each in names):
             return True
         if not (self.rounds and operator.rounds and kind in FORMATS):
@@ -175,7 +174,7 @@ class OnnxFunction(nn.Module):
     def _results(
         self, node: Any, operator: OnnxOperator, given: Sequence[Any], attributes: Mapping[str, Any]
     ) -> dict[str, Tensor]:
-        """Those of a node at one x, whose sizes are known before they are computed."""
+        """The results of a node at one x; their sizes are tested before they are computed."""
         arithmetic = [Numbers()] if operator.rounds else []
 
         def computed(*given: Any) -> dict[str, Tensor]:
@@ -186,7 +185,7 @@ class OnnxFunction(nn.Module):
             size = sum(y.numel() for y in computed(*without_values).values())
             if size <= MOST:
                 return computed(*given)
-        except Exception as error:  # of any kind: what is asked comes from a file
+        except Exception as error:  # operators of a file may fail in any way
             shape = "(1, n)" if self.batched else "(n,)"
             raise UsageError(
                 f"Expected {node.op_type} in {self.name!r} of one state of shape {shape}, got {one_line(error)}; "
@@ -200,7 +199,7 @@ class OnnxFunction(nn.Module):
         )
 
     def _counted(self, node: Any, results: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Constant results, of which there may be only so many numbers."""
+        """The constant results; refused if all constants together have too many entries."""
         self._made += sum(y.numel() for y in results.values())
         if self._made > MOST:
             raise self._too_large(node, self._made, MOST)
@@ -209,7 +208,7 @@ class OnnxFunction(nn.Module):
     def _require_moving(
         self, node: Any, kind: int, results: Mapping[str, Tensor], factors: Sequence[Tensor | None]
     ) -> None:
-        """Refuse values that depend on x and are many, or whole numbers, and products of matrices with many terms."""
+        """Refuse values that depend on x and have too many entries or products, or are whole numbers."""
         size = max(y.numel() for y in results.values())
         if node.op_type in ("MatMul", "Gemm") and factors and factors[0] is not None:
             size *= max(1, max(factors[0].shape, default=1))
@@ -241,7 +240,7 @@ class OnnxFunction(nn.Module):
         return kind
 
     def _require_whole(self, node: Any, operator: OnnxOperator, kind: int, given: Sequence[Any]) -> None:
-        """Refuse an operation on whole numbers that would leave their type, divide by 0, or is not known here."""
+        """Refuse an operation on whole numbers that leaves their type or divides by 0, or that has no rule here."""
         numbers = [y for k, y in enumerate(given) if isinstance(y, Tensor) and k not in operator.plain]
         if all(y.is_floating_point() or y.dtype == torch.bool for y in numbers) and kind not in WHOLE:
             return
@@ -307,7 +306,7 @@ class OnnxFunction(nn.Module):
         return value if isinstance(value, int | float) else list(value)
 
     def _kept(self, value: Any) -> Any:
-        """A constant argument: a floating-point tensor among the weights, anything else as it is."""
+        """A constant argument: the Weight of a floating-point tensor, added to the weights, or a plain value."""
         if not isinstance(value, Tensor) or not value.is_floating_point():
             return value
         self.weights.append(nn.Parameter(value, requires_grad=False))
@@ -322,7 +321,7 @@ def _plain(y: Tensor) -> Any:
 
 
 def tensor_of(proto: Any) -> Tensor:
-    """An onnx.TensorProto in float64, or in int64, or as truths."""
+    """An onnx.TensorProto as a tensor of float64, int64 or booleans."""
     array = np.asarray(library("onnx.numpy_helper").to_array(proto))
     if array.dtype != np.bool_:
         array = array.astype(np.float64) if proto.data_type in FORMATS else _whole(array)
@@ -341,7 +340,7 @@ def _named(names: Sequence[str], results: Any) -> dict[str, Tensor]:
 
 
 def _inputs(model: Any) -> list[Any]:
-    """The inputs that have no value in the file."""
+    """The inputs without a value in the file."""
     known = {each.name for each in model.graph.initializer}
     return [each for each in model.graph.input if each.name not in known]
 
@@ -368,7 +367,7 @@ def _input_of(model: Any, n: int, name: str) -> tuple[bool, int]:
 
 
 def library(name: str) -> Any:
-    """An optional module."""
+    """An optional module, imported now."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

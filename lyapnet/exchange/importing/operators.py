@@ -1,7 +1,8 @@
 """ONNX operators as torch functions of float64 numbers, with the semantics of opset 18 and later.
 
-Each takes the node's inputs and its attributes by their names in ONNX. Shapes, axes and exponents are plain Python
-numbers: they are constants of the graph. An operator that rounds takes the arithmetic of its type first.
+Each takes the inputs of a node, and its attributes by their names in ONNX. Shapes, axes and exponents are plain Python
+numbers, since they are constants of the graph. An operator that rounds takes the arithmetic of its type (Numbers) as
+first argument.
 """
 
 import math
@@ -15,16 +16,16 @@ from torch.nn import functional
 
 from lyapnet.exchange.importing.arithmetic import LARGEST_ANGLE, REPRESENTED, Numbers
 
-SLOPE = 0.009999999776482582  # of LeakyRelu unless it is given: 0.01 in float32
+SLOPE = 0.009999999776482582  # default slope of LeakyRelu, 0.01 in float32
 
 
 class OnnxOperator(NamedTuple):
-    """What an ONNX operator does."""
+    """An ONNX operator as a torch function."""
 
     function: Callable[..., Any]
-    plain: tuple[int, ...] = ()  # the inputs that are handed over as plain numbers, not as tensors
-    rounds: bool = True  # whether it rounds floating-point numbers, in the arithmetic that it then takes first
-    whole: bool = False  # whether it may be of whole numbers
+    plain: tuple[int, ...] = ()  # indices of the inputs that the function takes as plain numbers, not as tensors
+    rounds: bool = True  # whether it rounds floating-point numbers; the function then takes Numbers first
+    whole: bool = False  # whether it takes whole numbers
 
 
 def _basic(function: Callable[..., Tensor], whole: bool = False) -> OnnxOperator:
@@ -76,7 +77,7 @@ def _power(numbers: Numbers, x: Tensor, exponent: Any) -> Tensor:
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """log(1 + eˣ); beyond 40 that is x, in float64."""
+    """log(1 + eˣ); for x > 40 this is x in float64."""
     return functional.softplus(x, threshold=40)
 
 
@@ -91,7 +92,7 @@ def _divide(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _cast(numbers: Numbers, x: Tensor, to: int, saturate: int = 1) -> Tensor:
-    """x as another kind of number."""
+    """x in another number type."""
     if REPRESENTED[to] == torch.bool:
         return x if x.dtype == torch.bool else x != 0
     y = x.to(REPRESENTED[to])
@@ -164,7 +165,7 @@ def _split(
 
 
 def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[Tensor], Tensor]) -> OnnxOperator:
-    """A function of a sum over some axes, of a function of the numbers, and of how many they are."""
+    """The operator of_sum(Σ each(x), number of summands), with sums over some axes."""
 
     def reduced(
         numbers: Numbers, x: Tensor, axes: list[int] | None = None, keepdims: int = 1, noop_with_empty_axes: int = 0
@@ -180,7 +181,7 @@ def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[
 
 
 def _each(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
-    """A function of two, of any number."""
+    """A function of two tensors, extended to any number of them."""
     return lambda *tensors: reduce(function, tensors)
 
 
@@ -189,7 +190,7 @@ def _total(numbers: Numbers, *tensors: Tensor) -> Tensor:
 
 
 def _constant(**value: Any) -> Tensor:
-    """The one attribute that there is; numbers as tensors."""
+    """The value of the only attribute as a tensor."""
     (found,) = value.values()
     return found if isinstance(found, Tensor) else torch.as_tensor(
         found, dtype=torch.float64 if "float" in next(iter(value)) else torch.int64
@@ -224,7 +225,7 @@ OPERATORS: dict[str, OnnxOperator] = {
     "Sin": _wave("Sin", torch.sin),
     "Cos": _wave("Cos", torch.cos),
     "Tan": _wave("Tan", torch.tan),
-    # what does not round
+    # operators without rounding
     "Cast": OnnxOperator(_cast, whole=True),
     "Neg": _exact(torch.neg),
     "Abs": _exact(torch.abs),

@@ -1,4 +1,4 @@
-"""What the page computes in JavaScript: V, u, one step of the closed loop, and facts about a state."""
+"""The functions of the page in JavaScript: V, u, one step of the closed loop, and facts about a state."""
 
 import torch
 from torch import Tensor
@@ -12,8 +12,8 @@ from lyapnet.graphs.tracing import core_trace
 def functions_of(controller: Controller) -> str:
     """The text of `look(t, x, u, V)`, `step(t, x, after, cost, u, V)` and `about(x, goal, end, worst)`.
 
-    The first gives u(t, x) and V(t, x); the second also the state after one step of the closed loop and what the step
-    costs; the third the goal (of each member of a family), φ(x) and max_j h_j(x), −∞ where there are no constraints.
+    `look` computes u(t, x) and V(t, x); `step` also the state after one step of the closed loop and the cost of the
+    step; `about` the goal (of each member of a family), φ(x) and max_j h_j(x), −∞ without constraints.
 
     Raises:
         ExportError: a function of the controller cannot be traced, or an operation has no rule.

@@ -22,14 +22,14 @@ from lyapnet.task.constraints import StateLimits, names_of, parts_of
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.sets import Box
 
-LOOPS = 64  # closed loops from X₀ that say how far the axes go
-CHECKED = 32  # states at which the page holds itself against the controller
-MARGIN = 0.08  # of a range, on either side
+LOOPS = 64  # number of closed loops from X₀ for the ranges of the axes
+CHECKED = 32  # number of states at which the page compares its functions with the controller
+MARGIN = 0.08  # margin of the axes on either side, relative to the range of the points
 ENDINGS = (".html", ".htm")
 
 
 def write_page(controller: Controller, path: Path, title: str, funnel: KeptSide | None = None) -> None:
-    """Write the page of a controller, all or nothing.
+    """Write the page of a controller, as a whole or not at all.
 
     Raises:
         UsageError: the file has another ending; or as page_of.
@@ -44,8 +44,8 @@ def page_of(controller: Controller, title: str, funnel: KeptSide | None = None) 
     """The page as HTML.
 
     Args:
-        title: what the page calls the controller.
-        funnel: a proved one, to be drawn.
+        title: the title of the page.
+        funnel: a proved funnel to draw; None for none.
 
     Raises:
         UsageError: plotly is not installed.
@@ -64,9 +64,9 @@ def page_of(controller: Controller, title: str, funnel: KeptSide | None = None) 
 
 
 def json_in_script(content: Any) -> str:
-    """JSON for a script element, whose text neither ends nor begins another element or comment there.
+    """JSON for a script element, with all characters escaped that could begin or end an element or a comment there.
 
-    HTML knows no escapes within a script: after `<!--<script>`, not even `</script>` ends it. JSON does.
+    HTML has no escapes inside a script (after `<!--<script>`, not even `</script>` ends it), but JSON has.
     """
     return json.dumps(content, ensure_ascii=False, allow_nan=False).translate(ESCAPES)
 
@@ -75,7 +75,7 @@ ESCAPES = {ord(each): f"\\u{ord(each):04x}" for each in "<>&\u2028\u2029"}
 
 
 def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None) -> dict[str, Any]:
-    """What the page is told of a controller, as plain data; null stands for what is not finite."""
+    """The data of a controller for the page, as plain data; null stands for numbers that are not finite."""
     problem, system, box = controller.problem, controller.system, controller.initial_states
     center = box.center
     limits = problem.controls.fixed_limits or (-torch.inf, torch.inf)
@@ -136,13 +136,13 @@ def _start(controller: Controller) -> State:
 
 
 def _first(controller: Controller) -> State:
-    """The start of a closed loop that nobody chose: between the centre of X₀ and its upper corner."""
+    """The start of the first closed loop: in the middle between the centre of X₀ and its upper corner."""
     box = controller.initial_states
     return (box.center + box.upper) / 2
 
 
 def _extent(controller: Controller, funnel: KeptSide | None) -> Box:
-    """How far the axes go: around X₀, closed loops from there, the goal, limits of states and the set of a funnel."""
+    """The ranges of the axes: they contain X₀, closed loops from there, the goal, state limits and a funnel's D."""
     box = controller.initial_states
     try:
         x = controller.rollout(box.sample(LOOPS, stream(0, FIGURES))).x.flatten(0, 1)
@@ -155,7 +155,7 @@ def _extent(controller: Controller, funnel: KeptSide | None) -> Box:
             for i, limit in zip(part.states.tolist(), part.limits.to(lower), strict=True):  # a state may have two
                 lower[i], upper[i] = torch.minimum(lower[i], limit), torch.maximum(upper[i], limit)
     room = MARGIN * torch.where(upper > lower, upper - lower, 1 + lower.abs())
-    room[list(controller.system.constants)] = 0  # V was told no other parameters
+    room[list(controller.system.constants)] = 0  # V was trained for parameters of X₀ only
     lower, upper = lower - room, upper + room
     if funnel is not None:
         lower = torch.minimum(lower, funnel.states.lower.to(lower))
@@ -164,7 +164,7 @@ def _extent(controller: Controller, funnel: KeptSide | None) -> Box:
 
 
 def _checks(controller: Controller) -> dict[str, Any]:
-    """u, V and where a step leads at some times and states of X₀, as the controller has them."""
+    """The controller's u, V and next state at some times and states of X₀."""
     generator, horizon, step = stream(0, FIGURES), controller.horizon, controller.step
     x = controller.initial_states.sample(CHECKED, generator)
     nodes = torch.randint(horizon.steps, (CHECKED,), generator=generator)

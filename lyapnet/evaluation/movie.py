@@ -22,8 +22,8 @@ class Movie(ABC):
     """Frames at a rate, as a GIF or MP4.
 
     Args:
-        duration: of the closed loops, in seconds.
-        steps: how many they have.
+        duration: duration of the closed loops in seconds.
+        steps: number of their steps.
         rate: frames per second.
         speed: seconds of the system per second of the movie; None: 1, adapted to a duration of 3 to 10 s.
 
@@ -31,7 +31,7 @@ class Movie(ABC):
         UsageError: rate or speed is no positive number.
     """
 
-    palette: Image.Image | None = None  # of the GIF; None: of each frame
+    palette: Image.Image | None = None  # the palette of the GIF; None: one for each frame
 
     def __init__(self, duration: float, steps: int, rate: float, speed: float | None):
         if speed is None:

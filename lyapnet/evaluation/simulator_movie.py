@@ -1,4 +1,4 @@
-"""A closed loop in MuJoCo's simulator as MuJoCo draws it."""
+"""A movie of a closed loop in MuJoCo's simulator, drawn by MuJoCo."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -30,15 +30,15 @@ def renderer_of(plant: Plant) -> Any:
 
 
 class SimulatorMovie(Movie):
-    """The bodies of a plant along a closed loop, by its first camera, or by MuJoCo's if it has none.
+    """The bodies of a plant along a closed loop, seen by its first camera, or by MuJoCo's default one.
 
-    A plant without any shape is drawn as the boxes of its inertias.
+    A plant without shapes is drawn as the boxes of its inertias.
 
     Args:
         plant: the MuJoCo model.
-        renderer: of `renderer_of`.
-        positions: (N + 1, …) of all its joints.
-        duration: of the closed loop, in seconds.
+        renderer: from `renderer_of`.
+        positions: positions of all joints, (N + 1, …).
+        duration: duration of the closed loop in seconds.
     """
 
     def __init__(self, plant: Plant, renderer: Any, positions: NDArray, duration: float, rate: float = 20.0):

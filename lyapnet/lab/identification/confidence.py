@@ -1,4 +1,4 @@
-"""How well readings tell parameters: their covariance, and the directions in which they are not told."""
+"""The covariance of estimated parameters, and the directions in which the readings do not determine them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,35 +8,35 @@ from jaxtyping import Bool, Float
 
 from lyapnet.lab.identification.estimation import Solution
 
-NOT_AT_ALL = 1e-7  # singular value, relative to the greatest, from which effects of parameters count as the same
-NO_EFFECT = 1e-3  # of a change by all of its value on all readings together, in their noise: a parameter does not count
-ALIKE = 0.02  # share to which effects cancel in a direction that may be hardly told
-PART = 0.03  # square of the smallest part of a parameter in a direction by which it is not told, in units of its effect
-NAMED = 0.01  # smallest part of a parameter in a direction, relative to the greatest, that is named
+NOT_AT_ALL = 1e-7  # singular value, relative to the largest, below which a direction counts as undetermined
+NO_EFFECT = 1e-3  # effect on all readings, in units of noise, of a change by 100 %, below which a parameter has none
+ALIKE = 0.02  # singular value below which effects nearly cancel, so that a direction may be undetermined
+PART = 0.03  # smallest part of a parameter in undetermined directions, in units of its effect, that makes it so too
+NAMED = 0.01  # smallest part of a parameter in a direction, relative to the largest, that is reported
 
 Array = np.ndarray
 
 
 class Confidence(NamedTuple):
-    """What readings tell of p."""
+    """The uncertainty of p."""
 
-    covariance: Float[Array, "k k"]  # along what is told
-    told: Bool[Array, " k"]
-    directions: list[dict[str, float]]  # relative changes by name that are not told
+    covariance: Float[Array, "k k"]  # in the determined directions
+    told: Bool[Array, " k"]  # whether the readings determine each parameter
+    directions: list[dict[str, float]]  # the undetermined directions, as relative changes by name
 
 
 def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[str], lags: int = 0) -> Confidence:
-    """The covariance (MᵀM)⁻¹ of the parameters at a minimum, in the directions that readings tell.
+    """The covariance (MᵀM)⁻¹ of the parameters at a minimum, in the directions that the readings determine.
 
-    Where residuals are correlated it is (MᵀM)⁻¹ S (MᵀM)⁻¹, with the covariance S of the gradient in p by its samples.
+    If residuals are correlated, it is (MᵀM)⁻¹ S (MᵀM)⁻¹ with the covariance S of the gradient in p.
 
-    In units of what each parameter does by itself, ‖∂ŷ/∂p_i‖, a direction in which effects cancel has a small singular
-    value s, and 1/s is its standard deviation. It is not told if s is 0 up to rounding, nor if effects cancel to ALIKE
-    and a standard deviation changes some parameter by all of its value.
+    In units of the effect of each parameter alone, ‖∂ŷ/∂p_i‖, a direction in which effects cancel has a small singular
+    value s, and the standard deviation 1/s. It counts as undetermined if s is 0 up to rounding; or if s < ALIKE, and a
+    standard deviation changes some parameter by 100 %.
 
     Args:
         before: the parameters at the start.
-        lags: samples over which residuals are correlated; 0: they are white.
+        lags: number of samples over which residuals are correlated; 0 if they are white.
     """
     p = found.point.p
     scale = np.where(p != 0, np.abs(p), np.abs(before))
@@ -60,7 +60,7 @@ def confidence_of(found: Solution, before: Float[Array, " k"], names: Sequence[s
 
 
 def _covariance_of_gradient(scores: Sequence[Float[Array, "_ k"]], lags: int) -> Float[Array, "k k"]:
-    """Σ_l (1 − |l|/(L + 1)) Σ_t g_t g_{t+l}ᵀ over lags up to L, semidefinite by its weights.
+    """Σ_l (1 − |l|/(L + 1)) Σ_t g_t g_{t+l}ᵀ over lags |l| ≤ L; its weights make it positive semidefinite.
 
     Source: Newey, West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
     matrix", Econometrica 1987.

@@ -1,8 +1,8 @@
-"""Parameters and initial states under which trajectories are nearest to the readings, and how well these tell them.
+"""Finds the parameters and initial states whose trajectories are closest to the readings.
 
-What is minimised is Σ ‖(ŷ_k(p, x₀) − y_k)/σ‖² over the parameters p and the initial state of each piece, by
-scipy.optimize.least_squares with exact derivatives. In (p, x₀) the readings of a piece count through an orthogonal
-factor of their Jacobian alone, n + k + 1 rows in the place of thousands.
+scipy.optimize.least_squares minimises Σ ‖(ŷ_k(p, x₀) − y_k)/σ‖² over the parameters p and the initial state x₀ of each
+piece, with exact derivatives. The residuals and Jacobian of a piece, thousands of rows, are replaced by the triangular
+factor of their QR decomposition, which has n + k + 1 rows.
 """
 
 from collections.abc import Sequence
@@ -15,39 +15,39 @@ from jaxtyping import Float
 
 from lyapnet.lab.identification.shooting import Array, Path, Shooting
 
-MOST_EVALUATIONS = 60  # of one minimisation
-TOLERANCE = 1e-11  # of least_squares: relative changes of what is minimised and of its arguments, and the gradient
-# Standard deviation of a parameter around its start in units of its size. It is that wide so that it decides nothing
-# that readings tell, and keeps directions that they do not tell where they are.
+MOST_EVALUATIONS = 60  # largest number of evaluations in a minimisation
+TOLERANCE = 1e-11  # tolerance of least_squares for relative changes of the sum and the unknowns, and for the gradient
+# Standard deviation of a parameter around its start, in units of its size. It is so wide that it does not influence
+# what the readings determine, but keeps parameters near their start in the other directions.
 ANCHOR = 100.0
-FAINT = 1e-6  # a displacement of x₀ by its size that moves readings by less than so much of their noise is not told
+FAINT = 1e-6  # change of readings, in units of noise, by a change of x₀ by 100 %, below which x₀ is undetermined
 
 
 @dataclass(frozen=True)
 class Point:
-    """Parameters, initial states of pieces, and where their segments begin."""
+    """Parameters, initial states of the pieces, and states at the beginning of their segments."""
 
     p: Float[Array, " k"]
     x0: Float[Array, "pieces n"]
-    nodes: Float[Array, "segments n"]
+    nodes: Float[Array, "segments n"]  # at the beginning of segments
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A minimum, and what the readings say about it."""
+    """A minimum, with the numbers from which its uncertainty follows."""
 
     point: Point
     path: Path
     residuals: Float[Array, "samples q"]  # (ŷ − y) in the unit of each reading
-    leverage: Float[Array, " q"]  # sum of the diagonal entries of the hat matrix that belong to each kind of readings
-    root: Float[Array, "rows k"]  # M with the information MᵀM on p, whatever x₀
-    scores: Sequence[Float[Array, "_ k"]]  # of each piece, what each sample adds to the gradient in p, whatever x₀
-    size: Float[Array, " k"]  # ‖∂ŷ/∂p_i‖ in units of the noise, with x₀ known
+    leverage: Float[Array, " q"]  # sum of the diagonal entries of the hat matrix for each reading
+    root: Float[Array, "rows k"]  # M, where MᵀM is the information on p with unknown x₀
+    scores: Sequence[Float[Array, "_ k"]]  # for each piece, the gradient in p by samples, with unknown x₀
+    size: Float[Array, " k"]  # ‖∂ŷ/∂p_i‖ in units of the noise, with known x₀
     evaluations: int
 
 
 class _Evaluation(NamedTuple):
-    """Trajectories at some unknowns, with residuals and their Jacobian; None where there are none."""
+    """Trajectories for some unknowns w = (p, x₀), and (residuals, Jacobian); None if there are no trajectories."""
 
     w: Array
     path: Path | None
@@ -61,8 +61,8 @@ class Fit:
         shooting: (p, x₀) ↦ readings.
         sigma: standard deviation of each reading, (q,).
         bounds: least and greatest value of each parameter.
-        anchor: parameters near which directions stay that readings do not tell; None: p is known, and x₀ is sought.
-        spread: standard deviation of parameters around it; None: ANCHOR times their size.
+        anchor: parameters that undetermined directions stay close to; None: p is known, and only x₀ is unknown.
+        spread: standard deviation of parameters around the anchor; None: ANCHOR times their size.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Fit:
         self.k = 0 if anchor is None else shooting.k
         self._start: Point | None = None
         self._last: _Evaluation | None = None
-        self._accepted: _Evaluation | None = None  # the last one whose derivatives were asked for
+        self._accepted: _Evaluation | None = None  # the last one whose derivatives least_squares used
 
     def minimise(self, start: Point) -> Solution | None:
         """The minimum from a start; None if there are no trajectories from it."""
@@ -110,7 +110,7 @@ class Fit:
         return p, w[self.k :].reshape(-1, self.shooting.n)
 
     def _at(self, w: Array) -> "_Evaluation":
-        """What there is at some unknowns; segments begin where they did last, moved to first order."""
+        """The evaluation at some unknowns; segments begin at their last nodes, moved to first order."""
         for known in (self._last, self._accepted):
             if known is not None and np.array_equal(known.w, w):
                 return known
@@ -141,7 +141,7 @@ class Fit:
         return away / self.sigma, path.of_y / self.sigma[:, None]
 
     def _rows(self, p: Array, path: Path) -> tuple[Array, Array]:
-        """Residuals and their Jacobian, with the readings of each piece turned into n + k + 1 rows."""
+        """(residuals, Jacobian), with the readings of each piece reduced to n + k + 1 rows by QR."""
         n, k, (r, J) = self.shooting.n, self.k, self._weighted(path)
         pieces, width = len(self.shooting.pieces), n + k + 1
         residuals, jacobian = np.zeros(pieces * width + k), np.zeros((pieces * width + k, k + pieces * n))
@@ -157,7 +157,7 @@ class Fit:
         return residuals, jacobian
 
     def _by_piece(self, rows: Array) -> list[Array]:
-        """The rows (samples, q, c) of each piece, one below another."""
+        """The rows of each piece, (samples · q, c), from those of all pieces, (samples, q, c)."""
         ends = np.cumsum([len(piece) for piece in self.shooting.pieces])[:-1]
         return [part.reshape(-1, part.shape[-1]) for part in np.split(rows, ends)]
 
@@ -168,7 +168,7 @@ class Fit:
         return rows[0]
 
     def _jacobian(self, w: Array) -> Array:
-        """The derivatives, which are asked for where a step was taken."""
+        """The Jacobian; least_squares asks for it after an accepted step."""
         self._accepted = self._at(w)
         assert self._accepted.rows is not None
         return self._accepted.rows[1]
@@ -179,7 +179,7 @@ class Fit:
         parts, left = self._by_piece(J[..., : n + k]), self._by_piece(r[..., None])
         faint = np.diag(FAINT / np.maximum(np.abs(path.nodes).max(0), 1e-12))
         bases, alone = list[Array](), list[Array]()
-        for part in parts:  # with x₀ known a little, so that directions that readings do not tell take nothing away
+        for part in parts:  # `faint` is a weak prior on x₀: undetermined directions then take no information from p
             Q = np.linalg.qr(np.concatenate([part[:, :n], faint]))[0]
             of_p = np.concatenate([part[:, n:], np.zeros((n, k))])
             bases.append(Q[: len(part)])

@@ -1,4 +1,4 @@
-"""A figure of what was measured and what the fitted model gives, and of what is left between them."""
+"""A figure of readings, of the fitted model, and of their difference."""
 
 from collections.abc import Sequence
 
@@ -14,9 +14,9 @@ BAND = 2  # half-width of the band around zero, in standard deviations of a read
 
 
 def measured_and_fitted(found: Identification) -> Figure:
-    """For each reading data and model, and below their difference with a band of ± 2σ; recordings side by side.
+    """For each reading, data and model, and below their difference with a band of ± 2σ; recordings side by side.
 
-    What was held out is drawn in another colour; there, initial states alone are fitted.
+    Held-out data have another colour; there, only initial states are fitted.
     """
     names = list(dict.fromkeys(curve.name for curve in found.curves))[:MOST_RECORDINGS]
     readings = list(found.noise)[:MOST_READINGS]
@@ -54,12 +54,12 @@ def _draw(above: Axes, below: Axes, curves: Sequence[Curve], j: int, sigma: floa
 
 
 def _with_gaps(curve: Curve, values: np.ndarray) -> np.ndarray:
-    """Values with a gap wherever the model begins anew."""
+    """Values with a gap wherever the model starts again from another state."""
     return np.insert(values.astype(float), curve.starts[1:], np.nan)
 
 
 def _title(name: str, curves: Sequence[Curve]) -> str:
-    """The name of a recording, and how well each of its parts is fitted."""
+    """The name of a recording, and the fit of each of its parts."""
     parts = list[str]()
     for curve in curves:
         shares = ", ".join(f"{share:.1%}" for share in fit_of([curve]))

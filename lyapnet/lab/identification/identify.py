@@ -1,4 +1,4 @@
-"""Parameters of a system from measurements: what they are, how well they are known, and whether the model is right."""
+"""Estimates parameters of a system from measurements, with confidence intervals and tests of the model."""
 
 import math
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from lyapnet.task.systems import ControlSystem
 from lyapnet.training.stage_messages import StageReport, silent
 
 HELD_OUT = 0.25  # share of each recording, its end, that is not fitted
-LAGS_COUNTED = 4  # lags of residuals that intervals count with, in times after which they are no longer correlated
-AT = 1e-6  # distance from an end of the values that a system takes, relative to a parameter, that counts as there
+LAGS_COUNTED = 4  # lags of residuals in intervals, in multiples of the lag after which they are uncorrelated
+AT = 1e-6  # distance of a parameter from an end of its range, relative to its size, that counts as none
 
 Array = np.ndarray
 
@@ -38,16 +38,15 @@ def identify(
 ) -> Identification:
     """Fit parameters of a config's system to measurements, by multiple shooting with exact derivatives.
 
-    y_k = h(x(t_k)) + v_k with ẋ = f(x, u; p), u held between samples, and normal v, independent of each other.
+    The model is y_k = h(x(t_k)) + v_k with ẋ = f(x, u; p), u held between samples, and independent normal v_k.
 
     Args:
-        config: the system, X₀ for states that are not measured, and in outputs the noise where it is known.
+        config: the system, X₀ for states that are not measured, and in `outputs` the noise if it is known.
         data: recordings, or CSV files of them.
-        parameters: names of the numbers that are sought; none: those in the config's system.parameters.
+        parameters: names of the parameters to estimate; empty: those in the config's system.parameters.
         test: recordings that are held out.
-        held_out: share of each recording of data, its end, that is held out; None: 0.25, or 0 if there are others to
-            test with.
-        report: is told what is done.
+        held_out: share of each recording of `data`, at its end, that is held out; None: 0.25, or 0 with a `test`.
+        report: called with the stages of the work.
 
     Raises:
         UsageError: a name, a file or a number does not fit.
@@ -66,7 +65,7 @@ def split_recordings(
     test: Sequence[str | Path | Measurements],
     held_out: float | None,
 ) -> tuple[list[Measurements], list[Measurements]]:
-    """The recordings that are fitted, and those that are held out, as of `identify`."""
+    """(the recordings to fit, those that are held out); arguments as in `identify`."""
     given, tested = ([_recording(each, system) for each in many] for many in (data, test))
     share = (0.0 if tested else HELD_OUT) if held_out is None else held_out
     if not given or not 0 <= share < 1:
@@ -97,7 +96,7 @@ def _require_alike(recordings: Sequence[Measurements]) -> None:
 
 
 def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measurements]) -> Identification:
-    """What a minimum says."""
+    """The result of `identify` for a minimum."""
     sigma, names, recordings = search.noise(found), search.readings.names, search.recordings
     freedom = int(found.residuals.size - np.round(found.leverage.sum()))
     fitted, later = _curves(fit, found, held_out=False), held_out_curves(search, fit, found, tested)
@@ -132,7 +131,7 @@ def _conclude(search: Search, fit: Fit, found: Solution, tested: Sequence[Measur
 
 
 def _estimates(search: Search, found: Solution, confidence: Confidence, freedom: int) -> dict[str, Estimate]:
-    """The parameters by name, with intervals that end where the system's values end."""
+    """The parameters by name, with intervals that are cut to the values that the system takes."""
     from scipy.stats import t  # imported here because it takes 0.3 s
 
     p, before, (lower, upper) = found.point.p, search.unknown.before, search.bounds
@@ -152,9 +151,9 @@ def _estimates(search: Search, found: Solution, confidence: Confidence, freedom:
 
 
 def held_out_curves(search: Search, fit: Fit, found: Solution, tested: Sequence[Measurements]) -> list[Curve]:
-    """The model beside recordings that were not fitted, from initial states that are; none if it follows none."""
+    """Curves of held-out recordings and of the model, with fitted initial states; empty if the model follows none."""
     pieces, longest = fit.shooting.pieces, max((len(each) for each in tested), default=0)
-    cut = len(pieces) > len(search.recordings)  # the model forgets where it began, or is lost: here too
+    cut = len(pieces) > len(search.recordings)  # the fit had to cut recordings into pieces: here too
     segments = -(-min(longest, *(len(piece) for piece in pieces) if cut else [longest]) // SEGMENT)
     while segments:
         parts = [piece for each in tested for piece in each.pieces(segments * SEGMENT)]
@@ -167,8 +166,8 @@ def held_out_curves(search: Search, fit: Fit, found: Solution, tested: Sequence[
 
 
 def _curves(fit: Fit, found: Solution, held_out: bool) -> list[Curve]:
-    """Readings and model, the pieces of a recording one after another."""
-    y_hat = fit.shooting.y + found.residuals  # an angle in the turn in which it was read
+    """The curves of readings and model; the pieces of a recording form one curve."""
+    y_hat = fit.shooting.y + found.residuals  # angles are in the same turn as their readings
     ends, curves = np.cumsum([len(piece) for piece in fit.shooting.pieces])[:-1], list[Curve]()
     for piece, own in zip(fit.shooting.pieces, np.split(y_hat, ends), strict=True):
         last = curves[-1] if curves else None

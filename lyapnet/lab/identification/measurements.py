@@ -1,4 +1,4 @@
-"""What was measured of a plant: times, controls and readings, from CSV files whose columns are named."""
+"""Recordings of a plant: times, controls and readings, from CSV files with named columns."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,9 +17,9 @@ from lyapnet.lab.identification.units import factor, name_and_unit
 from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.systems import ControlSystem
 
-MOST_ROWS = 200_000  # of a file
-LARGEST_FILE = 40_000_000  # bytes
-LARGEST = 1e30  # number, whose square is one too
+MOST_ROWS = 200_000  # largest number of rows of a file
+LARGEST_FILE = 40_000_000  # largest size of a file in bytes
+LARGEST = 1e30  # largest number; squares do not overflow
 TIMES = ("t", "time")  # names of the column of times
 
 
@@ -28,8 +28,8 @@ class Measurements:
     """One recording of a plant.
 
     Args:
-        name: of its file, for messages.
-        t: rising times in s, (N,).
+        name: the name of its file, for messages.
+        t: increasing times in s, (N,).
         u: controls in the order of the system, (N, m); u[k] is held from t[k] to t[k + 1].
         y: readings at t, (N, q).
         outputs: names of the readings: states, or outputs that the system declares.
@@ -51,7 +51,7 @@ class Measurements:
         return replace(self, t=self.t[first:last], u=self.u[first:last], y=self.y[first:last])
 
     def pieces(self, length: int) -> list["Measurements"]:
-        """Parts of so many samples; the last one may be longer by up to a half."""
+        """Parts of this many samples; the last one may have up to half as many more."""
         first = range(0, max(1, len(self) - length // 2), length)
         return [self.part(i, i + length if i + length in first else len(self)) for i in first]
 
@@ -61,7 +61,7 @@ class NamedReadings(Outputs):
 
     Args:
         system: the system.
-        names: of the readings.
+        names: the names of the readings.
     """
 
     def __init__(self, system: ControlSystem, names: Sequence[str]):
@@ -83,7 +83,7 @@ class NamedReadings(Outputs):
 
 
 def readable(system: ControlSystem) -> dict[str, str]:
-    """Name ↦ unit of all that a reading can be: states, then the outputs that the system declares."""
+    """Name ↦ unit of everything that can be read: states, then the outputs that the system declares."""
     states = dict(zip(system.state_names, system.state_units, strict=True))
     if not system.has_output:
         return states
@@ -97,10 +97,10 @@ def readable(system: ControlSystem) -> dict[str, str]:
 def read_measurements(path: Path, system: ControlSystem) -> Measurements:
     """A recording from a CSV file: t, a column for each control, and one or more for states or outputs.
 
-    In names `_` stands for a space too. A column may have a unit, as in "angle [deg]"; else it is that of the system.
+    In names, `_` and a space are the same. A column may have a unit, as in "angle [deg]"; else it is the system's.
 
     Raises:
-        UsageError: the file is none, a column is missing or named twice, or times do not rise.
+        UsageError: the file is no such table, a column is missing or occurs twice, or times do not increase.
     """
     columns = read_columns(path, MOST_ROWS, LARGEST_FILE, "begin with t, controls and states")
     outputs = readable(system)

@@ -1,4 +1,4 @@
-"""What was identified, as tables, sentences, JSON and the YAML file that goes on with it."""
+"""Results of identification as tables, sentences, JSON and a YAML file with the estimates."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,9 +21,9 @@ from lyapnet.lab.identification.residuals import LEVEL, ResidualTest
 from lyapnet.lab.identification.results import Estimate, Identification
 from lyapnet.lab.identification.unknown_system import system_of
 
-DIGITS = 6  # of estimates in tables
-WIDTH = 120  # of lines of YAML
-WIDE = 0.5  # half of an interval relative to the value, beyond which the data hardly tell a parameter
+DIGITS = 6  # significant digits of estimates in tables
+WIDTH = 120  # characters in lines of YAML
+WIDE = 0.5  # half width of an interval relative to the value, above which a sentence warns
 
 
 def parameter_table(found: Identification, title: str) -> Table:
@@ -46,7 +46,7 @@ def reading_table(found: Identification) -> Table:
 
 
 def verdict(test: ResidualTest) -> str:
-    """What a test says, in a few words."""
+    """The result of a test in a few words."""
     found = list[str]()
     if test.white < LEVEL:
         found.append(f"correlated over {test.correlated + 1} samples ({_probability(test.white)})")
@@ -58,7 +58,7 @@ def verdict(test: ResidualTest) -> str:
 
 
 def sentences(found: Identification) -> list[str]:
-    """What a reader has to know beside the tables."""
+    """Sentences with advice, for below the tables."""
     told = list[str]()
     for direction in found.unknown_directions:
         changes = ", ".join(
@@ -92,7 +92,7 @@ def sentences(found: Identification) -> list[str]:
 
 
 def residual_sentences(residual: Residual) -> list[str]:
-    """Whether what the model lacks is told by these data, how large it is, and how steep."""
+    """Sentences on whether r(x) is needed, and on its bounds and slopes."""
     if not residual.before or math.isnan(residual.ratio):
         return ["r(x) is left out: nothing was held out to judge it by, or nothing of it is followed; hold some out."]
     pairs = [f"{name} {residual.before[name]:.3g} → {residual.after[name]:.3g}" for name in residual.before]
@@ -111,13 +111,13 @@ def residual_sentences(residual: Residual) -> list[str]:
 
 
 def round_up(bound: float) -> str:
-    """A number ≥ 0 with three digits, not below it."""
+    """A number ≥ 0 with three digits, rounded upwards."""
     text = f"{bound:.3g}"
     return text if float(text) >= bound else f"{bound + 10.0 ** (math.floor(math.log10(bound)) - 2):.3g}"
 
 
 def _residual_as_data(residual: Residual) -> dict[str, Any]:
-    """What r(x) brings, and its bounds."""
+    """The errors with and without r(x), and its bounds, as plain data."""
     network, (largest, slopes) = residual.network, residual.network.bounds()
     names = [network.states[i] for i in network.rates]
     return {
@@ -137,7 +137,7 @@ def _residual_as_data(residual: Residual) -> dict[str, Any]:
 
 
 def _in_percent(direction: Mapping[str, float]) -> dict[str, float]:
-    """A direction with a smallest change of one percent, and no change above ten."""
+    """A direction, scaled so that its smallest change is 1 %, or less if another one would exceed 10 %."""
     sizes = [abs(change) for change in direction.values()]
     scale = min(0.01 / min(sizes), 0.1 / max(sizes))
     return {name: scale * change for name, change in direction.items()}
@@ -161,7 +161,7 @@ def _half(one: Estimate) -> str:
 
 
 def rounded_interval(low: float, high: float) -> tuple[float, float]:
-    """An interval that contains a given one, with two digits of its width."""
+    """An interval that contains a given one, with ends rounded outwards to two digits of its width."""
     if not high > low:
         return low, high
     unit = 10.0 ** (math.floor(math.log10(high - low)) - 1)
@@ -169,7 +169,7 @@ def rounded_interval(low: float, high: float) -> tuple[float, float]:
 
 
 def as_json(found: Identification, files: Sequence[str], residual: Residual | None = None) -> dict[str, Any]:
-    """Everything but the curves as plain data."""
+    """All results except the curves, as plain data."""
     return plain(
         {
             "files": [*files],
@@ -198,13 +198,13 @@ def identified_yaml(
     files: Sequence[str],
     residual: Residual | None = None,
 ) -> tuple[str, str]:
-    """The config with the estimates and their ranges as YAML, and what is to be said of these ranges.
+    """(the config with the estimates and their ranges as YAML, a note if the ranges are not in it, else empty).
 
     Args:
-        path: of the config.
-        key: randomise or family, which gets the ranges.
-        files: names of the data.
-        residual: what is added to the equations, if it is needed.
+        path: the file of the config.
+        key: randomise or family, the section for the ranges.
+        files: names of the files of data.
+        residual: r(x), which is added to the equations if it is needed.
     """
     told = {name: one for name, one in found.parameters.items() if one.told}
     ranges = {name: [*rounded_interval(one.low, one.high)] for name, one in told.items()}
@@ -241,7 +241,7 @@ def identified_yaml(
         *(residual_sentences(residual) if residual is not None and added else []),
         *([f"{key}: {_in_a_line(ranges)}"] if refused and ranges else []),
     ]
-    config_from_plain(content)  # raises what would be refused later
+    config_from_plain(content)  # raises an error if the config is invalid
     text = "".join(f"# {' '.join(line.split())}\n" for line in comments) + yaml.dump(
         content, Dumper=_LineByLine, default_flow_style=None, sort_keys=False, allow_unicode=True, width=WIDTH
     )
@@ -249,7 +249,7 @@ def identified_yaml(
 
 
 class _LineByLine(yaml.SafeDumper):
-    """Writes texts of several lines as such."""
+    """Writes strings of several lines as blocks."""
 
 
 _LineByLine.add_representer(
@@ -265,7 +265,7 @@ def _in_a_line(content: Any) -> str:
 def _refusal(
     config: Config, values: Mapping[str, float], ranges: Mapping[str, list[float]], key: str, others: Mapping[str, Any]
 ) -> str:
-    """Why a config can have no such ranges; empty if it can."""
+    """The reason why the config cannot have these ranges; empty if it can."""
     if not ranges:
         return "the data tell no range"
     beside = {

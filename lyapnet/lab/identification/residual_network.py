@@ -1,10 +1,10 @@
-"""What a model of equations lacks, as a small network r(x) that is added to it: ẋ = F(x, u) + r(x).
+"""A small network r(x) that is added to the equations of a model, for effects that it lacks: ẋ = F(x, u) + r(x).
 
-r_i = s_i Σ_h c_ih tanh(w_hᵀξ + b_h)/√H with ξ = x, moved and scaled to [−1, 1] on the data. w and b are drawn once, so
-that r is linear in what is fitted, c, by the same multiple shooting as parameters before it, with the penalty Σ c². s_i
-is the root mean square of ẋ_i on the data. The network is written as further lines of the equations: f + r is affine in
-u where f was, and training, certificates and exports read it like any other.
-Source: Rahimi, Recht, "Random features for large-scale kernel machines", NIPS 2007 (layers that are drawn).
+r_i = s_i Σ_h c_ih tanh(w_hᵀξ + b_h)/√H, where ξ is x shifted and scaled to [−1, 1] on the data, and s_i is the root
+mean square of ẋ_i on the data. w and b are random and fixed, so r is linear in c, which is fitted by multiple shooting
+like parameters, with the penalty Σ c². The network is written as further lines of the equations; so training,
+certificates and exports can use the system like any other, and it stays control-affine.
+Source: Rahimi, Recht, "Random features for large-scale kernel machines", NIPS 2007 (random layers).
 """
 
 from collections.abc import Callable, Sequence
@@ -27,11 +27,11 @@ from lyapnet.lab.identification.unknown_system import UnknownSystem, system_of
 from lyapnet.task.systems import ControlSystem, EquationSystem, moving_states, states_that_are_rates
 from lyapnet.training.stage_messages import StageReport, silent
 
-UNITS = 24  # of the network
+UNITS = 24  # default of H
 SLOPE = 1.5  # standard deviation of wᵀξ over the box of the data, about
-NEEDED = 0.9  # r counts as needed if the error on what was held out falls to less than so much of it
-MOST_PARTS = 20_000  # of the box of the data, for bounds
-DIGITS = 9  # of numbers in the equations
+NEEDED = 0.9  # ratio of the held-out errors with and without r, below which r counts as needed
+MOST_PARTS = 20_000  # largest number of parts of the box of the data, for bounds
+DIGITS = 9  # significant digits of numbers in the equations
 
 Array = np.ndarray
 
@@ -43,7 +43,7 @@ class Network:
     Args:
         states: names of all states.
         rates: indices of the states whose rates get a residual.
-        center, width: (n,) of the box of the data; ξ = (x − center)/width.
+        center, width: middle and half widths of the box of the data, (n,); ξ = (x − center)/width.
         w, b: (H, n) and (H,).
         scale: s_i, (outputs,).
         c: (outputs, H).
@@ -123,12 +123,12 @@ class Network:
 
 @dataclass(frozen=True)
 class Residual:
-    """A network, and what it brings on data that were held out.
+    """A network r(x), and the errors with it on held-out data.
 
     Args:
         network: r(x).
-        config: of the system with it.
-        before, after: root mean square error of each reading that was held out, without and with it; NaN for none.
+        config: the config of the system with r(x).
+        before, after: root mean square error of each held-out reading without and with r(x); empty without any.
     """
 
     network: Network
@@ -138,13 +138,13 @@ class Residual:
 
     @property
     def ratio(self) -> float:
-        """The errors with it over those without it, in the mean of readings; NaN if nothing was held out."""
+        """The mean over readings of the error with r(x) over that without; NaN if nothing was held out."""
         pairs = [(self.after[name], self.before[name]) for name in self.before]
         return float(np.mean([a / b if b else 1.0 for a, b in pairs])) if pairs else np.nan
 
     @property
     def needed(self) -> bool:
-        """Whether it makes the error on held-out data smaller by more than chance and a fit may."""
+        """Whether r(x) lowers the errors on held-out data by more than chance: ratio < NEEDED."""
         return self.ratio < NEEDED
 
 
@@ -157,11 +157,11 @@ def identify_residual(
     units: int = UNITS,
     report: StageReport = silent,
 ) -> Residual:
-    """Fit r(x) to what a model with its parameters leaves, on the same recordings.
+    """Fit r(x) to the same recordings as the parameters, which stay as they were found.
 
     Args:
         config: the system, as for `identify`.
-        found: its parameters, from the same data.
+        found: the result of `identify` for the same data.
         units: H.
 
     Raises:
@@ -189,7 +189,7 @@ def identify_residual(
 
 
 def require_equations(system: ControlSystem) -> None:
-    """Raise UsageError for a system to which no network can be added as equations."""
+    """Refuse a system without equations, to which no network can be added."""
     if not isinstance(system, EquationSystem):
         raise UsageError(
             f"Expected a system of equations for --residual, got {system.title}; write it as one, or as a CasADi, URDF "

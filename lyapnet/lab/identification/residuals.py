@@ -1,7 +1,7 @@
-"""Tests of what a fit leaves: whether it is white, free of the controls, and as large as the noise is said to be.
+"""Tests of residuals: whether they are white, independent of earlier controls, and as large as the known noise.
 
-Of a right model the residuals are the noise of the readings. What remains of a wrong one is correlated in time, or with
-controls that acted before.
+The residuals of a correct model are the noise of the readings. Those of a wrong model are correlated in time, or with
+earlier controls.
 Source: Ljung, Box, "On a measure of lack of fit in time series models", Biometrika 1978; Ljung, System Identification,
 1999, ch. 16.6.
 """
@@ -12,24 +12,24 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-LAGS = 25  # of tests, in samples
-MOST_LAGS = 1000  # over which residuals are correlated, as far as that is counted
-LEVEL = 1e-3  # below this probability a right model is given up
+LAGS = 25  # largest lag in tests, in samples
+MOST_LAGS = 1000  # largest lag at which correlation is computed, in samples
+LEVEL = 1e-3  # significance level: with a smaller probability, a test says that the model is wrong
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Residuals of one reading: how probable they are if the model is right, in three respects.
+    """Tests of the residuals of one reading: three p-values under the assumption that the model is correct.
 
     Args:
         reading: its name.
-        white: probability of such correlations in time.
-        controls: of such correlations with controls that acted before; None where no control moves.
-        size: of so large or so small residuals; None where the noise is not known.
-        ratio: root mean square of the residuals, relative to the noise that is known; None likewise.
-        correlated: samples after which the autocorrelation is within what chance gives; 0 if it is at once.
+        white: p-value of their correlations in time.
+        controls: p-value of their correlations with earlier controls; None if no control changes.
+        size: p-value of their size; None if the noise is not known.
+        ratio: root mean square of the residuals, relative to the known noise; None if it is not known.
+        correlated: largest lag, in samples, up to which the autocorrelation exceeds chance; 0 for none.
     """
 
     reading: str
@@ -41,7 +41,7 @@ class ResidualTest:
 
     @property
     def explained(self) -> bool:
-        """Whether nothing is left that a model could explain."""
+        """Whether the residuals are white and independent of controls, so that the model lacks nothing."""
         return self.white >= LEVEL and (self.controls is None or self.controls >= LEVEL)
 
     @property
@@ -60,10 +60,10 @@ def examine(
     """The tests of one reading.
 
     Args:
-        residuals: of each recording.
-        controls: of each recording.
-        noise: standard deviation that the config says; None if it is not known.
-        freedom: degrees of freedom of the residuals together.
+        residuals: those of each recording.
+        controls: those of each recording.
+        noise: standard deviation of the noise in the config; None if it is not known.
+        freedom: degrees of freedom of all residuals together.
     """
     from scipy.stats import chi2  # imported here because it takes 0.3 s
 
@@ -91,7 +91,7 @@ def examine(
 
 
 def _independence(residuals: Sequence[Array], controls: Sequence[Array], lags: int) -> float | None:
-    """The probability of so good a regression of residuals on the controls of the samples before; see examine."""
+    """The p-value of a regression of residuals on the controls of earlier samples; None if no control changes."""
     from scipy.stats import chi2
 
     earlier, later = list[Array](), list[Array]()
@@ -105,6 +105,6 @@ def _independence(residuals: Sequence[Array], controls: Sequence[Array], lags: i
     if not scale.any() or not e.any():
         return None
     left, values, _ = np.linalg.svd(U[:, scale > 0] / scale[scale > 0], full_matrices=False)
-    left = left[:, values > 1e-6 * values[0]]  # steps and slow controls repeat themselves
+    left = left[:, values > 1e-6 * values[0]]  # columns of steps and slow controls are nearly dependent
     explained = float(((left.T @ e) ** 2).sum() / (e @ e))
     return float(chi2.sf(len(e) * explained, left.shape[1]))

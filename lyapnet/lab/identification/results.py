@@ -1,4 +1,4 @@
-"""What measurements tell of the parameters of a system."""
+"""Results of an identification: estimates, fits, tests and curves."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,29 +16,29 @@ Array = np.ndarray
 
 
 class Estimate(NamedTuple):
-    """A parameter."""
+    """The estimate of a parameter."""
 
-    before: float  # in the config
-    value: float
-    low: float  # of its 95 % interval, which is infinite if the data do not tell the parameter
+    before: float  # its value in the config
+    value: float  # the estimate
+    low: float  # the ends of its 95 % interval, which is infinite if the data do not determine the parameter
     high: float
     at_bound: bool  # whether it is at the least or greatest value that the system takes
 
     @property
     def told(self) -> bool:
-        """Whether the data tell it."""
+        """Whether the data determine the parameter."""
         return self.high - self.low < math.inf
 
 
 class Curve(NamedTuple):
-    """Readings of a recording, and those of the fitted model: (N,) and (N, q)."""
+    """Readings y of a recording, and those ŷ of the fitted model, (N, q) each, at times t, (N,)."""
 
     name: str
     t: Array
     y: Array
     y_hat: Array
     held_out: bool
-    starts: Array  # indices at which the model begins anew from a state of its own
+    starts: Array  # indices at which the model starts again from another state
 
 
 def fit_of(curves: Sequence[Curve]) -> list[float]:
@@ -50,21 +50,21 @@ def fit_of(curves: Sequence[Curve]) -> list[float]:
 
 @dataclass(frozen=True)
 class Identification:
-    """What measurements tell of the parameters of a system.
+    """The result of `identify`.
 
     Args:
-        parameters: by name.
-        covariance: of the estimates, (k, k); of parameters that are not told, along what is told.
-        unknown_directions: relative changes of parameters by name, which together leave the data as they are.
-        noise: standard deviation of each reading, estimated or as the config says.
-        fit: 1 − ‖y − ŷ‖/‖y − ȳ‖ of each reading, on what was fitted.
-        fit_held_out: the same on what was not, from initial states of its own; empty if nothing was held out.
-        tests: of the residuals, one for each reading.
-        curves: for figures.
-        units: of the readings.
-        freedom: readings without unknowns.
-        pieces: how many, each from a state of its own.
-        states, controls: some of those along what was fitted, (segments, n) and (segments, m).
+        parameters: the estimates by name.
+        covariance: that of the estimates, (k, k), in the directions that the data determine.
+        unknown_directions: relative changes of parameters by name, which together do not change the readings.
+        noise: standard deviation of each reading, estimated or from the config.
+        fit: 1 − ‖y − ŷ‖/‖y − ȳ‖ of each reading, on the fitted data.
+        fit_held_out: the same on held-out data, with fitted initial states; empty if nothing was held out.
+        tests: the tests of the residuals, one for each reading.
+        curves: readings and model, for figures.
+        units: the units of the readings.
+        freedom: degrees of freedom, the number of readings minus that of unknowns.
+        pieces: number of pieces, each with its own initial state.
+        states, controls: some of those on the fitted trajectories, (segments, n) and (segments, m).
     """
 
     parameters: dict[str, Estimate]

@@ -1,6 +1,6 @@
-"""The way to the estimates: short pieces of recordings first, then longer ones, and the noise of readings on the way.
+"""The search for the estimates: fits to short pieces of recordings, then to longer ones, with estimates of the noise.
 
-Short pieces follow the data whatever the parameters, and tell them roughly; with these, longer ones can be joined.
+The model can follow short pieces with any parameters, which give rough estimates; with these it follows longer pieces.
 """
 
 from collections.abc import Sequence
@@ -19,30 +19,31 @@ from lyapnet.task.problem import TRIED
 from lyapnet.task.systems import states_that_are_rates
 from lyapnet.training.stage_messages import StageReport
 
-FIRST_PIECES, SHORTEST = 40, 40  # pieces of the first fit at most, and samples of each at least
-FEWEST = 8  # samples of a recording
-LONGER = 4  # times as long are the pieces of each further fit
-# A piece ends where an error of its initial state has grown by so much: readings beyond would tell parameters to more
-# digits than any plant has, as nothing is said here of what disturbs it on the way.
+FIRST_PIECES, SHORTEST = 40, 40  # largest number of pieces of the first fit, and least number of samples of each
+FEWEST = 8  # least number of samples of a recording
+LONGER = 4  # ratio of the lengths of pieces in successive fits
+# A piece ends where an error of its initial state has grown by this factor. Longer ones would seem to determine
+# parameters to more digits than is true of any plant, because the model has no disturbances.
 GROWTH = 1e3
-MOST_UNKNOWNS = 1500  # parameters and initial states of pieces together; the time grows with their cube
-ROUNDS, SETTLED = 8, 0.01  # fits with new standard deviations of readings, until these change by less than so much
-LEAST_NOISE = 1e-9  # of readings, relative to their size
-ACCURATE, MOST_SUBSTEPS = 0.05, 64  # largest error of integration, in standard deviations of readings
-EXACT = 1e-6  # of data without noise: what counts as such a standard deviation, relative to the size of readings
-SMOOTHED = 7  # samples over which the rate of a reading is averaged for a first guess
+MOST_UNKNOWNS = 1500  # largest number of parameters and initial states; the time grows with its cube
+ROUNDS, SETTLED = 8, 0.01  # largest number of fits with new noise, and its relative change at which they end
+LEAST_NOISE = 1e-9  # least standard deviation of readings, relative to their size
+ACCURATE = 0.05  # largest error of integration in standard deviations of readings
+MOST_SUBSTEPS = 64  # largest number of integration steps between samples
+EXACT = 1e-6  # least standard deviation for this test, relative to the size of readings (data without noise)
+SMOOTHED = 7  # number of samples over which the rate of a reading is averaged for a first guess
 START_BETTER = "start from better values in system.parameters, or correct names and units of columns"
 
 Array = np.ndarray
 
 
 class Search:
-    """From a system and recordings to the minimum.
+    """The search for the minimum.
 
     Args:
         unknown: the system.
-        recordings: what is fitted.
-        report: is told what is done.
+        recordings: the recordings to fit.
+        report: called with the stages of the work.
     """
 
     def __init__(self, unknown: UnknownSystem, recordings: Sequence[Measurements], report: StageReport):
@@ -106,7 +107,7 @@ class Search:
         )
 
     def start(self, shooting: Shooting, p: Array) -> Point:
-        """A point from what readings say of the states."""
+        """A first point, with states that are estimated from the readings."""
         states = [self._guess(piece) for piece in shooting.pieces]
         return Point(p, np.stack([x[0] for x in states]), np.concatenate([x[::SEGMENT] for x in states]))
 
@@ -146,7 +147,7 @@ class Search:
     # Noise
 
     def _first_noise(self) -> Array:
-        """The noise of readings by their third differences, in which smooth motion hardly counts; (q,)."""
+        """The standard deviation of readings by their third differences, which are small for smooth motion; (q,)."""
         differences = [np.diff(each.y, 3, 0) for each in self.recordings if len(each) > 3]
         found = np.sqrt(np.mean(np.concatenate(differences) ** 2, 0) / 20)
         return np.maximum(found, self._least_noise)
@@ -157,13 +158,13 @@ class Search:
         return LEAST_NOISE * np.where(size > 0, size, 1.0)
 
     def noise(self, found: Solution) -> Array:
-        """The standard deviation of each reading, by the residuals where it is not known; (q,)."""
+        """The standard deviation of each reading, (q,): as known, or estimated from the residuals."""
         freedom = np.maximum(len(found.residuals) - found.leverage, 1.0)
         estimated = np.sqrt((found.residuals**2).sum(0) / freedom)
         return np.where(np.isnan(self.known), np.maximum(estimated, self._least_noise), self.known)
 
     def _settle(self, fit: Fit, start: Point) -> tuple[Fit, Solution] | None:
-        """The minimum with the noise that it says itself, and with short enough steps; None: no trajectories."""
+        """The minimum with the noise that its residuals have, and with short enough steps; None: no trajectories."""
         size = self._least_noise / LEAST_NOISE
         for _ in range(ROUNDS):
             found, shooting = fit.minimise(start), fit.shooting

@@ -1,12 +1,12 @@
-"""Multiple shooting: readings that a plant gives from some initial states, and their exact derivatives.
+"""Multiple shooting: readings of a model from given initial states, and their exact derivatives.
 
 A piece of a recording begins in an unknown state x₀. It is divided into segments, which are integrated all at once.
-With ξ_s the state in which segment s begins, e_s(ξ_s, p) where it ends, Φ = ∂e/∂ξ and Γ = ∂e/∂p, Newton's method
+With the state ξ_s at the beginning of segment s, e_s(ξ_s, p) at its end, Φ = ∂e/∂ξ and Γ = ∂e/∂p, Newton's method
 
     ξ_0 = x₀,   ξ_{s+1} ← e_s + Φ_s (ξ_s⁺ − ξ_s)
 
-joins them: it converges where one long integration would have left the data, as the segments begin near them. The
-derivatives of the joined trajectory follow as N_{s+1} = Φ_s N_s + Γ_s.
+joins them. It converges also where one long integration would leave the data, because all segments begin near them. The
+derivatives of the joined trajectory follow from N_{s+1} = Φ_s N_s + Γ_s.
 Source: Bock, "Recent advances in parameter identification techniques for ODE", 1983; Albersmeyer, Diehl, "The lifted
 Newton method and its application in optimization", SIAM Journal on Optimization 2010.
 """
@@ -25,17 +25,17 @@ from lyapnet.task.family import with_attributes
 from lyapnet.task.horizon import TABLEAUX, weighted_sum
 from lyapnet.task.systems import ControlSystem
 
-SEGMENT = 20  # samples of a segment; so many steps follow one another, all else is done at once
-JOINED = 1e-9  # largest gap between two segments, relative to the largest value of each state
-MOST_JOINS = 15  # Newton steps, after which segments count as not to be joined
-LARGEST = 1e60  # number along a trajectory that is followed, and of its derivatives
-MOST_ROWS = 100_000  # of one batch of derivatives, which bounds the memory
+SEGMENT = 20  # samples of a segment; steps within a segment follow one another, all segments are done at once
+JOINED = 1e-9  # largest gap between joined segments, relative to the largest value of each state
+MOST_JOINS = 15  # largest number of Newton steps
+LARGEST = 1e60  # largest number on a trajectory and in its derivatives; squares do not overflow
+MOST_ROWS = 100_000  # largest number of rows in a batch of derivatives, to limit the memory
 
 Array = np.ndarray
 
 
 class Model:
-    """A system whose parameters are unknown, and what is read of its state.
+    """A system with unknown parameters, and its readings.
 
     Args:
         system: the system, in float64.
@@ -53,15 +53,15 @@ class Model:
 
     @torch.no_grad()
     def values(self, function: Callable[..., Tensor], x: Tensor, p: Tensor, *others: Tensor) -> Tensor:
-        """y of (system, x, *others) ↦ y, at states (rows, n)."""
+        """The values of a function (system, x, *others) ↦ y at states (rows, n)."""
         return function(self.member(p.unbind()), x, *others)
 
     @torch.enable_grad()
     def derivatives(self, function: Callable[..., Tensor], x: Tensor, p: Tensor, *others: Tensor) -> Tensor:
-        """∂y/∂(x, p) (rows, outputs, n + k) of (system, x, *others) ↦ y, at states (rows, n).
+        """∂y/∂(x, p), (rows, outputs, n + k), of a function (system, x, *others) ↦ y at states (rows, n).
 
-        The function sees one row at a time, by vmap: to it a parameter is a number, and is that of the row alone. All
-        is copied once for each output, so that one backward pass computes all rows of the Jacobian.
+        By vmap, the function is called with one row, in which each parameter is a number. All arguments are copied once
+        for each output, so that one backward pass computes all rows of the Jacobian.
 
         Args:
             others: further arguments of the function, (rows, …).
@@ -85,7 +85,7 @@ class Model:
 
 
 def rk4(system: ControlSystem, x: Tensor, u: Tensor, h: Tensor) -> Tensor:
-    """x after times h under controls u that are held, one step each."""
+    """x after one Runge-Kutta step of length h, (…, 1), with u held."""
     tableau, slopes = TABLEAUX["rk4"], list[Tensor]()
     for row in tableau.a:
         stage = x + h * weighted_sum(row, slopes) if any(row) else x
@@ -105,7 +105,7 @@ class Path(NamedTuple):
 
 @dataclass(frozen=True)
 class _Steps:
-    """The steps of all segments: those of a segment follow one another, segments stand side by side."""
+    """The steps of all segments."""
 
     h: Float[Tensor, "steps segments one"]  # lengths in s; 0 beyond the end of a piece
     u: Float[Tensor, "steps segments m"]
@@ -115,9 +115,9 @@ class Shooting:
     """(p, x₀) ↦ readings of some pieces of recordings, with their derivatives.
 
     Args:
-        model: the plant, and what is read of it.
-        pieces: of recordings.
-        substeps: steps of the Runge–Kutta method between two samples, in which u is held.
+        model: the system and its readings.
+        pieces: pieces of recordings.
+        substeps: number of Runge-Kutta steps between two samples, with u held.
     """
 
     def __init__(self, model: Model, pieces: Sequence[Measurements], substeps: int = 1):
@@ -140,7 +140,7 @@ class Shooting:
         """The trajectories from x₀; None if they are not finite, or segments cannot be joined.
 
         Args:
-            nodes: where segments begin at first.
+            nodes: first values of the states ξ at the beginning of segments.
         """
         nodes = nodes.copy()
         nodes[self.first] = x0
@@ -162,7 +162,7 @@ class Shooting:
         return None
 
     def _follow(self, phi: Array, source: Array, start: Array) -> Array:
-        """v with v = start where a piece begins, and v_{s+1} = Φ_s v_s + source_s from segment to segment."""
+        """v with v = start at the first segment of each piece, and v_{s+1} = Φ_s v_s + source_s."""
         v = np.zeros((len(phi), *start.shape[1:]))
         for g in range(max(self.counts)):
             rows = np.array([at + g for at, count in zip(self.first, self.counts, strict=True) if g < count])
@@ -209,7 +209,7 @@ class Shooting:
         return torch.stack(path)
 
     def integration_error(self, path: Path, p: Array) -> Float[Array, " q"]:
-        """How far half the step moves readings at the ends of segments, summed over a piece; the most of all pieces."""
+        """Change of readings where segments end if steps are halved, summed over a piece; the largest of all pieces."""
         finer = Shooting(self.model, self.pieces, 2 * self.substeps)
         moved = np.abs(finer._read_ends(path.nodes, p) - self._read_ends(path.nodes, p))
         return np.add.reduceat(moved, self.first).max(0)

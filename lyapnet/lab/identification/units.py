@@ -31,16 +31,16 @@ _WITH_UNIT = re.compile(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]")
 
 
 def name_and_unit(heading: str) -> tuple[str, str]:
-    """("angle", "deg") of "angle [deg]" or "angle (deg)"; the unit is empty where there is none."""
+    """("angle", "deg") for "angle [deg]" or "angle (deg)"; the unit is empty if there is none."""
     found = _WITH_UNIT.fullmatch(heading.strip())
     return (found[1], found[2].strip()) if found else (heading.strip(), "")
 
 
 def factor(unit: str, wanted: str, column: str) -> float:
-    """How many of the wanted unit one of a unit is; 1 where a column names no unit.
+    """The factor that converts numbers from a unit to the wanted unit; 1 for a column without unit.
 
     Raises:
-        UsageError: the unit is unknown, or of another kind; names the column.
+        UsageError: the unit is unknown or of another kind; the message names the column.
     """
     unit, goal = (SPELLINGS.get(each, each) for each in (unit, wanted))
     if not unit or unit == goal:

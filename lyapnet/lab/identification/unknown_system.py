@@ -1,4 +1,4 @@
-"""The system of a config whose parameters are sought: which they are, how they are read, and what values it takes."""
+"""The system of a config with unknown parameters: their names, how f and g read them, and the values they may have."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,9 @@ from lyapnet.task.problem import TRIED
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
 
-SLIGHT = 0.01  # relative change of a parameter at which the system is compared with one that is built with it
-ASIDE = 0.1  # how far from a state that X₀ fixes that is done, relative to it, or of its unit
-STEP = 1e-2  # step of the differences that its derivative is compared with, in such changes
+SLIGHT = 0.01  # relative change of a parameter for the comparison with a system that is built with it
+ASIDE = 0.1  # distance from states that X₀ fixes, relative to them (or in their unit), for this comparison
+STEP = 1e-2  # step of finite differences for the comparison of derivatives, relative to this change
 
 Array = np.ndarray
 
@@ -35,10 +35,10 @@ def system_of(config: Config) -> tuple[ControlSystem, Box]:
 
 
 def sought_parameters(config: Config, system: ControlSystem, names: Sequence[str]) -> dict[str, float]:
-    """Name ↦ value of the parameters to fit: those named, or the numbers in the config's system.parameters, or all.
+    """Name ↦ value of the parameters to fit: those named, or those in the config's system.parameters, or all.
 
     Raises:
-        UsageError: a name is no number that the system keeps, or there is none.
+        UsageError: a name is no number that the system has as an attribute, or there is none.
     """
     arguments = inspect.signature(type(system)).parameters
     kept = {name: getattr(system, name, None) for name in arguments}
@@ -62,17 +62,16 @@ def sought_parameters(config: Config, system: ControlSystem, names: Sequence[str
 
 
 class UnknownSystem:
-    """A config's system with some parameters that are sought.
+    """A config's system with unknown parameters.
 
     Args:
         config: the system, and X₀.
-        names: of the parameters; none: see `sought_parameters`.
+        names: the names of the parameters; empty: as in `sought_parameters`.
         outputs: names of the readings.
-        spread: standard deviations of the parameters around their values in the config; None: so large that they hardly
-            count.
+        spread: standard deviations of the parameters around their values in the config; None: very large.
 
     Raises:
-        UsageError: a parameter is none, or f and g do not read it as they have to.
+        UsageError: a name is no parameter, or f and g do not read it as self.NAME.
     """
 
     def __init__(self, config: Config, names: Sequence[str], outputs: Sequence[str], spread: np.ndarray | None = None):
@@ -95,7 +94,7 @@ class UnknownSystem:
         generator = torch.Generator().manual_seed(0)
         x = self.box.sample(TRIED, generator).double()
         beside = ASIDE * x.abs().where(x != 0, 1.0) * torch.rand(x.shape, generator=generator, dtype=torch.float64)
-        x = torch.where(self.box.widths > 0, x, x + beside)  # where X₀ fixes a state, what multiplies it may not count
+        x = torch.where(self.box.widths > 0, x, x + beside)  # at a fixed state of 0, its factors would have no effect
         u = torch.rand(TRIED, self.system.m, generator=generator, dtype=torch.float64)
         slight = torch.zeros_like(p)
         slight[i] = SLIGHT * (abs(float(p[i])) or 1.0) * (-1 if p[i] < 0 else 1)
@@ -137,14 +136,14 @@ class UnknownSystem:
             )
 
     def _built(self, changes: Mapping[str, float]) -> ControlSystem | None:
-        """The system with other arguments; None where its constructor refuses them."""
+        """The system with other arguments; None if its constructor refuses them."""
         try:
             return type(self.system)(**{**self.config.system.parameters, **changes}).double()
         except Exception:  # the constructor may be the user's
             return None
 
     def bounds(self) -> tuple[Array, Array]:
-        """The least and greatest values of parameters: 0 where the constructor refuses another sign."""
+        """The least and greatest values of parameters; 0 is one of them if the constructor refuses the other sign."""
         lower, upper = np.full(len(self.names), -np.inf), np.full(len(self.names), np.inf)
         for i, (name, value) in enumerate(zip(self.names, self.before, strict=True)):
             size = abs(value) or 1.0

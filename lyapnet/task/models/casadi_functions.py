@@ -32,20 +32,20 @@ EXPRESSIONS = {
     },
     **{name.upper(): f"{name}({{0}}, {{1}})" for name in ("atan2", "hypot", "fmod", "copysign")},
 }  # fmt: skip
-RESULTS = ("xdot", "ode", "rhs", "f", "f_expl", "dx")  # names of the derivative, if there are several results
+RESULTS = ("xdot", "ode", "rhs", "f", "f_expl", "dx")  # names by which ẋ is found among several results
 
 
 class Model(NamedTuple):
-    """The equations of a model, the names in them, and values to compare them with.
+    """The equations of a model, the names in them, and values of the model for a comparison.
 
     Args:
-        equations: lines as of lyapnet.task.systems.formulas.
+        equations: lines in the syntax of lyapnet.task.systems.formulas.
         states, controls, parameters: names, in their order.
-        points: for each compared point the values of states, controls and parameters, and then of ẋ.
-        units: of states and controls; none: not known.
+        points: for each point of the comparison the values of states, controls, parameters and ẋ.
+        units: units of states, then of controls; empty if unknown.
         angles: names of the states that are angles in rad.
-        limits: least and greatest controls; None: not known.
-        drawing: lines as of lyapnet.task.systems.drawing; empty: not known.
+        limits: least and greatest controls; None if unknown.
+        drawing: lines in the syntax of lyapnet.task.systems.drawing; empty if unknown.
     """
 
     equations: str
@@ -65,7 +65,7 @@ def model_of_function(function: Any, states: Sequence[str] = (), controls: Seque
     x and u are the inputs with these names, or else the first two; all others are parameters.
 
     Args:
-        states, controls: names in the place of those of the function's symbols.
+        states, controls: names that replace those of the function's symbols.
 
     Raises:
         UsageError: an operation has no expression, or the function has other inputs or results.
@@ -104,9 +104,9 @@ def model_of_function(function: Any, states: Sequence[str] = (), controls: Seque
 
 
 def _expanded(casadi: Any, function: Any) -> Any:
-    """An MX function as elementary operations, linear solves included, which CasADi does not expand by itself."""
+    """An MX function as elementary operations, also for linear solves, which CasADi does not expand by itself."""
     inputs = function.mx_in()
-    results = function.call(inputs, True, False)  # with the functions that it calls written out
+    results = function.call(inputs, True, False)  # inlines the functions that it calls
     inlined = casadi.Function(function.name(), inputs, results)
     operations = [k for k in range(inlined.n_instructions()) if inlined.instruction_id(k) == casadi.OP_SOLVE]
     if not operations:
@@ -119,7 +119,7 @@ def _expanded(casadi: Any, function: Any) -> Any:
     ).expand()
     given = function.sx_in()
     solutions = [casadi.SX.zeros(each.sparsity()) for each in symbols]
-    for k, each in enumerate(solves):  # in the order of the function, so that each needs those before it alone
+    for k, each in enumerate(solves):  # in the order of the function, so that each needs only those before it
         A, B = parts.call([*given, *solutions])[2 * k : 2 * k + 2]
         solutions[k] = casadi.solve(A.T if each.info()["tr"] else A, B)
     written = [casadi.cse(each) for each in parts.call([*given, *solutions])[len(systems) :]]
@@ -129,7 +129,7 @@ def _expanded(casadi: Any, function: Any) -> Any:
 def function_of_text(casadi: Any, text: str) -> Any:
     """The function in the text of Function.save or Function.serialize.
 
-    It may run code that the text names: call it where nothing can be opened, or on a text that you wrote.
+    This may run code that the text names: call it in a process that cannot open files, or with your own text.
     """
     try:
         found = casadi.StringDeserializer(text).unpack()  # of save
@@ -207,7 +207,7 @@ def _is_name(text: str) -> bool:
 
 
 def _prefix(taken: Sequence[str]) -> str:
-    """What names of intermediate results begin with."""
+    """A prefix for names of intermediate results that no taken name has."""
     prefix = "v"
     while any(name.startswith(prefix) and name[len(prefix) :].isdigit() for name in taken):
         prefix += "_"
@@ -217,11 +217,11 @@ def _prefix(taken: Sequence[str]) -> str:
 def assignments(
     function: Any, names: Mapping[int, Sequence[str]], taken: Sequence[str]
 ) -> tuple[list[str], list[dict[int, str]]]:
-    """The operations of an SX function as assignments, in their order; and for each result the texts of its entries.
+    """(the operations of an SX function as assignments, in their order; for each result, its entries as text).
 
     Args:
-        names: of the entries of each input by its index; others are 0.
-        taken: names that intermediate results do not have.
+        names: index of an input ↦ names of its entries; inputs without names are 0.
+        taken: names that intermediate results must not have.
     """
     import casadi
 
@@ -261,12 +261,12 @@ def _number(value: float) -> str:
 
 
 def _values(function: Any, inputs: Sequence[int], result: int) -> Iterator[list[float]]:
-    """Values of x, u, p and ẋ at random points, x and u positive at half of them, by CasADi's own evaluation."""
+    """Values of x, u, p and ẋ at random points, evaluated by CasADi; x and u are positive at half of the points."""
     draw = random.Random(0)
     for k in range(POINTS):
         given = [[0.0] * function.numel_in(i) for i in range(function.n_in())]
         for i in inputs:
-            positive = i in inputs[2:] or k % 2  # as parameters, levels and concentrations are
+            positive = i in inputs[2:] or k % 2  # parameters, levels and concentrations are positive
             given[i] = [draw.uniform(0.5, 1.5) if positive else draw.gauss(0, 1) for _ in given[i]]
         value = function.call(given)[result]
         flat = [float(value[k]) for k in range(value.numel())]

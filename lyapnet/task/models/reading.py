@@ -1,8 +1,8 @@
-"""Reads a model's file in a process of its own that can open no file, so that nothing that the file holds is run.
+"""Reads a model's file in a separate process that cannot open files, so that the file can do no harm.
 
-A CasADi file may name libraries to load and compilers to call, and a robot's description other files. The process
-reads the content from its standard input after it has given up opening files and starting programs, has a limit of time
-and of memory, and prints equations as JSON.
+A CasADi file may name libraries to load and compilers to call, and a robot's description may name other files. The
+process first gives up opening files and starting programs, and limits its time and memory. Then it reads the content
+from its standard input, and prints equations as JSON.
 """
 
 import json
@@ -15,11 +15,11 @@ from typing import Any
 from lyapnet.base.errors import UsageError, one_line
 from lyapnet.base.files import LARGEST_TEXT, read_file
 
-EXTRAS = {"casadi": "oracle", "urdf": "robots", "mjcf": "robots,mujoco"}  # what each kind of model needs
+EXTRAS = {"casadi": "oracle", "urdf": "robots", "mjcf": "robots,mujoco"}  # kind of model ↦ extras of lyapnet to install
 KINDS = tuple(EXTRAS)
-SECONDS = 60  # of CPU, and twice as many by the clock
-LINEAR_SOLVERS = ("qr", "ldl", "symbolicqr", "csparse", "lsqr")  # CasADi's own, each in a library
-MEMORY = 8 * 2**30  # bytes of addresses, of which CasADi's libraries alone take about one
+SECONDS = 60  # limit of the CPU time; the limit of real time is twice as long
+LINEAR_SOLVERS = ("qr", "ldl", "symbolicqr", "csparse", "lsqr")  # those of CasADi, each in a library
+MEMORY = 8 * 2**30  # limit of the address space in bytes; CasADi's libraries take about 2**30
 
 _CHILD = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from lyapnet.task.models.reading import child; child()"
@@ -30,11 +30,11 @@ def read_model(path: Path, kind: str, options: Mapping[str, Any]) -> dict[str, A
     """The fields of the Model in a file, by name.
 
     Args:
-        kind: of KINDS.
-        options: names of states and controls in the place of the model's own.
+        kind: one of KINDS.
+        options: names of states and controls that replace those of the model.
 
     Raises:
-        UsageError: no such file, a library is missing, or the file holds something else.
+        UsageError: there is no such file, a library is missing, or the file is no such model.
     """
     try:
         content = read_file(path, LARGEST_TEXT)
@@ -63,7 +63,7 @@ def read_model(path: Path, kind: str, options: Mapping[str, Any]) -> dict[str, A
 
 
 def child() -> None:
-    """The process: reads a request and a file from standard input, and prints the model or an error as JSON."""
+    """The main function of the process: reads a request and a file from standard input, and prints JSON."""
     request, content = sys.stdin.buffer.read().split(b"\n", 1)
     asked = json.loads(request)
     try:
@@ -72,7 +72,7 @@ def child() -> None:
         answer = reader(content, **asked["options"])
     except UsageError as error:
         answer = {"error": str(error)}
-    except Exception as error:  # of many kinds: the file is a stranger's
+    except Exception as error:  # the file may be of unknown origin, and fail in any way
         answer = {
             "error": f"Expected a {asked['kind']} model in {asked['name']}, got {one_line(error)[:200]}; write it "
             "again, with the model alone."
@@ -81,7 +81,7 @@ def child() -> None:
 
 
 def _reader(kind: str) -> Any:
-    """The function that reads a kind of model, with all that it imports."""
+    """The function that reads a kind of model, after all imports that it needs."""
     try:
         if kind == "casadi":
             import casadi
@@ -89,14 +89,14 @@ def _reader(kind: str) -> Any:
             from lyapnet.task.models.casadi_functions import function_of_text, model_of_function
 
             for name in LINEAR_SOLVERS:
-                casadi.has_linsol(name)  # loads it
+                casadi.has_linsol(name)  # loads its library
             return lambda content, **options: model_of_function(
                 function_of_text(casadi, content.decode("ascii")), **options
             )._asdict()
         from lyapnet.task.models import robots
 
         read = robots.model_of_urdf if kind == "urdf" else robots.model_of_mjcf
-        read(robots.SMALLEST_URDF if kind == "urdf" else robots.SMALLEST_MJCF)  # loads what is loaded when it is used
+        read(robots.SMALLEST_URDF if kind == "urdf" else robots.SMALLEST_MJCF)  # makes all imports at first use
         return lambda content, **options: read(content, **options)._asdict()
     except ImportError as error:
         raise UsageError(
@@ -105,7 +105,7 @@ def _reader(kind: str) -> Any:
 
 
 def _give_up_files() -> None:
-    """Give up opening files, and limit time and memory."""
+    """Give up opening files and starting programs, and limit time and memory."""
     try:
         import resource
     except ImportError as error:

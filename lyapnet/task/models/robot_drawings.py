@@ -1,8 +1,8 @@
-"""What robots look like in a plane: their links as shapes whose places are equations of q, as lines of a drawing.
+"""Drawings of robots in a plane: lines of text with the shapes of links, whose positions are expressions of q.
 
-Boxes, cylinders, capsules and spheres of the file are drawn; a link without any is drawn as lines to the joints on it,
-or as the box of its inertia, if there are none away from its origin. As robots.py, this imports nothing that needs
-torch.
+Boxes, cylinders, capsules and spheres of the file are drawn. A link without any is drawn as lines from its origin to
+the joints on it or, if all of them are at the origin, as the box of its inertia. Like robots.py, this imports nothing
+that needs torch.
 """
 
 import math
@@ -15,9 +15,9 @@ import numpy as np
 from lyapnet.task.models.casadi_functions import assignments
 
 MOST = 100  # largest number of bodies that are drawn
-WATER = 1000.0  # kg/m³, the density of the ball that is drawn of a point mass
-SAME = 1e-9  # difference of directions and places below which a robot moves in a plane
-COSINE, SINE = math.cos(math.pi / 6) / 2, math.sin(math.pi / 6) / 2  # of y at 30° and half its length
+WATER = 1000.0  # kg/m³, the density of the ball by which a point mass is drawn
+SAME = 1e-9  # largest difference of directions and positions (m) that counts as none
+COSINE, SINE = math.cos(math.pi / 6) / 2, math.sin(math.pi / 6) / 2  # the y axis in oblique views: 30°, half as long
 # views as (axis that they look along, its two rows of (x, y, z)); the last one is oblique, for robots in space
 VIEWS = (
     (1, np.array([[1, 0, 0], [0, 0, 1]])),
@@ -32,8 +32,8 @@ class Body(NamedTuple):
 
     Args:
         kind: box, cylinder, capsule, sphere or bone, a line from the link's origin to `place`.
-        place, turn: of its centre and axes; the columns of `turn` are the axes, the last one a cylinder's.
-        size: half lengths along the axes in m, (radius, radius, half length) of what is round.
+        place, turn: its centre, and its axes as columns; the last one is the axis of a cylinder or capsule.
+        size: half lengths along the axes in m; (radius, radius, half length) of cylinders and capsules.
     """
 
     link: str
@@ -44,7 +44,7 @@ class Body(NamedTuple):
 
 
 def bodies_of_urdf(root: ET.Element) -> list[Body]:
-    """The boxes, cylinders and spheres of the links of a URDF tree; what cannot be read is left out."""
+    """The boxes, cylinders and spheres of the links of a URDF tree; shapes that cannot be read are left out."""
     found = list[Body]()
     for link in root.findall("link"):
         for elements in (link.findall("visual"), link.findall("collision")):
@@ -100,9 +100,9 @@ def drawing_of(urdf: str, bodies: Sequence[Body], frames: Mapping[str, Any], q: 
 
 
 def _view(casadi: Any, frames: Mapping[str, Any], q: Any) -> tuple[int | None, Any, dict[str, Any]]:
-    """The axis along which a robot is seen and the rows of the view, and its frames at q = 0.
+    """(the axis along which a robot is seen or None, the rows of the view, its frames at q = 0).
 
-    It is an axis about which alone all links turn, and along which none moves; a robot without one is seen obliquely.
+    All links turn only about this axis, and none moves along it; a robot without such an axis is seen obliquely.
     """
     function, random = casadi.Function("frames", [q], list(frames.values())), np.random.default_rng(0)
     d = q.shape[0]
@@ -120,10 +120,10 @@ def _view(casadi: Any, frames: Mapping[str, Any], q: Any) -> tuple[int | None, A
 
 
 def _shapes(body: Body, normal: Any) -> Iterator[tuple[str, list[Any], Sequence[float]]]:
-    """The shapes of a body, each as kind, points (x, y, z) in the frame of its link, and what follows these.
+    """The shapes of a body, each as (kind, points (x, y, z) in the frame of its link, further arguments).
 
     Args:
-        normal: the direction of the view in that frame; None: it changes.
+        normal: the direction of the view in that frame; None if it changes with q.
     """
     place = np.asarray(body.place, dtype=float)
     if body.kind == "bone":

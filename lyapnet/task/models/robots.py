@@ -1,9 +1,8 @@
 """Robots from URDF and MJCF files, as CasADi functions (x, u) ↦ ẋ with x = (q, q̇).
 
 adam-robotics computes the mass matrix M(q) and the bias forces h(q, q̇) (Featherstone's algorithms on CasADi symbols);
-ẋ is then (q̇, M⁻¹(τ(u) − h − D q̇ − friction)). MuJoCo reads MJCF, and its own forward dynamics are what the result is
-compared with. As casadi_functions, this runs in a process without access to files, and imports nothing that needs
-torch.
+ẋ is then (q̇, M⁻¹(τ(u) − h − D q̇ − friction)). MuJoCo reads MJCF, and the result is compared with its forward dynamics.
+Like casadi_functions, this runs in a process without access to files, and imports nothing that needs torch.
 """
 
 import math
@@ -20,9 +19,9 @@ from lyapnet.base.names import identifier
 from lyapnet.task.models.casadi_functions import Model, model_of_function
 from lyapnet.task.models.robot_drawings import Body, bodies_of_mjcf, bodies_of_urdf, drawing_of
 
-GRAVITY = 9.81  # m/s², in the direction −z, for URDF, which names none
-RATE, TORQUE, FORCE = "_rate", "_torque", "_force"  # what names end with of a joint's rate, and of what moves it
-SLIDING = 0.05  # rad/s or m/s in which dry friction turns: its force is −friction · tanh(speed / SLIDING)
+GRAVITY = 9.81  # m/s², in the direction −z, for URDF, which has no gravity
+RATE, TORQUE, FORCE = "_rate", "_torque", "_force"  # endings of the names of a joint's rate and of its motor
+SLIDING = 0.05  # rad/s or m/s, width of the transition of dry friction −friction · tanh(speed / SLIDING)
 TOLERANCE = 1e-9  # largest relative difference from MuJoCo's accelerations
 
 
@@ -30,11 +29,11 @@ class Joint(NamedTuple):
     """A joint that moves.
 
     Args:
-        slides: whether it is prismatic, in m and N, instead of an angle in rad with N·m.
+        slides: whether it is prismatic (m, N) instead of an angle (rad, N·m).
         damping, friction: of its rate, in N·m s/rad and N·m, or N s/m and N.
-        armature: inertia that is added on the diagonal of M.
-        stiffness, rest: of a spring, −stiffness (q − rest).
-        zero: q at which the links are as the file draws them.
+        armature: inertia that is added to the diagonal of M.
+        stiffness, rest: those of a spring with the force −stiffness (q − rest).
+        zero: q in the pose of the file.
     """
 
     name: str
@@ -62,17 +61,17 @@ class Actuator(NamedTuple):
 
 
 class Robot(NamedTuple):
-    """Links in URDF, and what moves them."""
+    """Links in URDF, with joints and actuators."""
 
     urdf: str
     joints: list[Joint]
     actuators: list[Actuator]
     gravity: Sequence[float] = (0.0, 0.0, -GRAVITY)
-    bodies: Sequence[Body] = ()  # that the file draws
+    bodies: Sequence[Body] = ()  # the shapes of the file
 
 
 def model_of_urdf(content: bytes, states: Sequence[str] = (), controls: Sequence[str] = ()) -> Model:
-    """The equations of a robot in URDF whose first link stands still.
+    """The equations of a robot in URDF whose first link is fixed.
 
     Joints are revolute, continuous, prismatic or fixed. A joint with an effort limit of 0 has no motor; without a limit
     its motor has no bound.
@@ -130,7 +129,7 @@ def _links(robot: Robot) -> Any:
 
 
 def _drawn(robot: Robot, q: Any) -> Any:
-    """The positions of the joints from where the file draws them."""
+    """The positions of the joints relative to the pose of the file."""
     return q - np.array([each.zero for each in robot.joints])
 
 
@@ -158,7 +157,7 @@ def _function(robot: Robot, friction: bool = True) -> Any:
 
 
 def _with_turns_apart(urdf: str) -> str:
-    """URDF in which joints that slide do not turn: a fixed joint before them does, as adam-robotics 0.3 needs it."""
+    """URDF in which a fixed joint before each prismatic one has its rotation, as adam-robotics 0.3 requires."""
     root = ET.fromstring(urdf)
     for joint in root.findall("joint"):
         if joint.get("type") == "prismatic":
@@ -236,7 +235,7 @@ def _require_actuators(robot: Robot) -> None:
 
 
 def _require_positive(link: ET.Element) -> None:
-    """Refuse a mass or moments of inertia that no body has."""
+    """Refuse a negative mass or moment of inertia."""
     mass, inertia = link.find("inertial/mass"), link.find("inertial/inertia")
     least = 0.0 if mass is None else _number(mass, "value", 0.0)
     if inertia is not None:
@@ -308,7 +307,7 @@ def _robot_of_mjcf(mujoco: Any, model: Any) -> Robot:
 
 
 def _actuators(mujoco: Any, model: Any) -> Iterator[Actuator]:
-    """The actuators of a MuJoCo model; anything else than a force that is affine in q, q̇ and u is refused."""
+    """The actuators of a MuJoCo model; refused unless their forces are affine in q, q̇ and u."""
     for k in range(model.nu):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, k) or f"actuator_{k}"
         gain, bias = model.actuator_gainprm[k], model.actuator_biasprm[k]
@@ -376,7 +375,7 @@ def _text(numbers: Any) -> str:
 
 
 def _require_equal(mujoco: Any, model: Any, robot: Robot) -> None:
-    """Compare accelerations with MuJoCo's own at random states, without contacts, limits and dry friction."""
+    """Refuse accelerations that differ from MuJoCo's at random states, without contacts, limits and dry friction."""
     flags = mujoco.mjtDisableBit
     model.opt.disableflags |= flags.mjDSBL_CONTACT | flags.mjDSBL_LIMIT | flags.mjDSBL_FRICTIONLOSS
     data, function = mujoco.MjData(model), _function(robot, friction=False)

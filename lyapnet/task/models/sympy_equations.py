@@ -13,14 +13,14 @@ def sympy_system(
 ) -> EquationSystem:  # fmt: skip
     """The system ẋ = rates of SymPy expressions, such as `KanesMethod.rhs()` of sympy.physics.mechanics.
 
-    Symbols, and functions of time such as dynamicsymbols("q"), are called as they print, without "(t)".
+    The name of a symbol, or of a function of time such as dynamicsymbols("q"), is its text without "(t)".
 
     Args:
         rates: ẋ, a column or list with an expression for each state.
-        states, controls: their symbols, or symbol ↦ unit.
+        states, controls: the symbols, or symbol ↦ unit.
         parameters: symbol ↦ value of all other symbols, in SI units.
         angles: the states that are angles in rad.
-        title: what the system is called in tables.
+        title: the name of the system in tables.
 
     Raises:
         UsageError: a symbol is neither state, control nor parameter, or an operation has no expression.
@@ -39,7 +39,7 @@ def _units_by_name(given: Mapping[Any, str] | Sequence[Any]) -> dict[str, str]:
 
 
 def _lines(rates: Sequence[Any], given: Sequence[Any], states: Sequence[str]) -> Iterator[str]:
-    """The assignments of some expressions, with repeated parts as lines of their own."""
+    """The expressions as assignments, with a line for each repeated part."""
     import sympy
     from sympy.printing.pycode import PythonCodePrinter
 
@@ -67,5 +67,5 @@ def _lines(rates: Sequence[Any], given: Sequence[Any], states: Sequence[str]) ->
 
 
 def _name_of(symbol: Any) -> str:
-    """How a symbol or function of time prints."""
+    """The text of a symbol or function of time, without "(t)"."""
     return str(symbol).removesuffix("(t)")

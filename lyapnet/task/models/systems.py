@@ -1,4 +1,4 @@
-"""Systems made of models: from files, which a config names, and from objects in Python."""
+"""Systems from models: from files that a config names, and from objects in Python."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,21 +11,21 @@ from lyapnet.task.models.casadi_functions import Model, model_of_function
 from lyapnet.task.models.reading import read_model
 from lyapnet.task.systems.equations import EquationSystem, defined
 
-TOLERANCE = 1e-12  # largest relative difference between equations and the model they came from
+TOLERANCE = 1e-12  # largest relative difference between equations and their model
 
 
 def model_of_file(
     path: Path, kind: str, states: Mapping[str, str], controls: Mapping[str, str], parameters: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[list[float]] | None]:
-    """The equations, states, controls, angles and drawing of a model's file, as a config's section `system` has them.
+    """The equations, states, controls, angles and drawing of a model's file, as fields of a config's section `system`.
 
     Args:
-        kind: of KINDS.
-        states, controls: name ↦ unit in the place of the model's names; none: the model's own.
+        kind: one of lyapnet.task.models.reading.KINDS.
+        states, controls: name ↦ unit, which replace those of the model; empty: those of the model.
         parameters: values of all parameters.
 
     Returns:
-        the section, and the least and greatest controls; None if the model has no limits.
+        (the section, the least and greatest controls or None if the model has no limits).
 
     Raises:
         UsageError: the file cannot be read, or a parameter is missing or unknown.
@@ -41,16 +41,16 @@ def casadi_system(
 ) -> EquationSystem:  # fmt: skip
     """The system ẋ = F(x, u; p) of a CasADi function (x, u, p…) ↦ ẋ, SX or an MX that CasADi can expand.
 
-    It is control-affine where its operations are. x and u are the inputs with these names, or else the first two.
+    It is control-affine if its operations are. x and u are the inputs with these names, or else the first two.
 
     Args:
         function: a casadi.Function.
-        states, controls: names, or name ↦ unit, in the place of those of the function's symbols.
+        states, controls: names, or name ↦ unit, which replace those of the function's symbols.
         angles: names of the states that are angles in rad.
         parameters: p by name, in SI units.
 
     Raises:
-        UsageError: the function has an operation without torch's, other inputs, or another result.
+        UsageError: torch lacks an operation of the function, or the function has other inputs or results.
     """
     x, u = ({name: given[name] if isinstance(given, Mapping) else "" for name in given} for given in (states, controls))
     section = _section(model_of_function(function, list(x), list(u)), x, u, parameters, function.name())
@@ -60,7 +60,7 @@ def casadi_system(
 def _section(
     model: Model, states: Mapping[str, str], controls: Mapping[str, str], parameters: Mapping[str, Any], name: str
 ) -> dict[str, Any]:
-    """Equations, states and controls of a model, compared with its values."""
+    """The equations, states and controls of a model, after a comparison with its values."""
     _require_parameters(model, parameters, name)
     units, n = model.units or [""] * len([*model.states, *model.controls]), len(model.states)
     x = states or dict(zip(model.states, units[:n], strict=True))
@@ -80,7 +80,7 @@ def _require_parameters(model: Model, parameters: Mapping[str, Any], name: str) 
 
 
 def _require_equal(model: Model, cls: type[EquationSystem], name: str) -> None:
-    """Compare equations with the model's own values at its points."""
+    """Refuse equations that differ from the model's values at its points."""
     n, m = len(model.states), len(model.controls)
     for point in model.points:
         numbers = torch.tensor(point, dtype=torch.float64)

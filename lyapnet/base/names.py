@@ -1,15 +1,15 @@
-"""Names of states, controls, parameters and joints as texts write them."""
+"""Names of states, controls, parameters and joints in configs, equations and files."""
 
 import re
 from typing import Any
 
 
 def joined(name: Any) -> str:
-    """A name with _ for its spaces, by which configs and equations write it."""
+    """A name with _ for spaces, as configs and equations write it."""
     return str(name).replace(" ", "_")
 
 
 def identifier(name: str, kind: str = "joint") -> str:
-    """A name of letters, digits and _, as of a joint in a file; its kind comes first if no letter does."""
+    """A name with _ for all but letters and digits, with its kind in front if it does not begin with a letter."""
     text = re.sub(r"\W", "_", name)
     return text if text[:1].isalpha() else f"{kind}_{text}"

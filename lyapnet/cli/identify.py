@@ -19,20 +19,18 @@ def identify(
     ],
     parameters: Annotated[
         list[str] | None,
-        typer.Option(help="What is sought; else the numbers in system.parameters.", metavar="NAME,NAME,…"),
+        typer.Option(help="Parameters to estimate; else those in system.parameters.", metavar="NAME,NAME,…"),
     ] = None,
     test: Annotated[
-        list[Path] | None, typer.Option(help="A file that is held out, once or more.", metavar="FILE.csv")
+        list[Path] | None, typer.Option(help="A file to hold out; may be repeated.", metavar="FILE.csv")
     ] = None,
     held_out: Annotated[
         float | None,
-        typer.Option(min=0, max=0.9, help="Share of each file that is held out, its end; 0.25, or 0 with --test."),
+        typer.Option(min=0, max=0.9, help="Share of each file to hold out, at its end; 0.25, or 0 with --test."),
     ] = None,
-    family: Annotated[
-        bool, typer.Option("--family", help="Write the ranges as a family, in the place of randomise.")
-    ] = False,
+    family: Annotated[bool, typer.Option("--family", help="Write the ranges as family instead of randomise.")] = False,
     with_residual: Annotated[
-        bool, typer.Option("--residual", help="Also fit what the equations lack, r(x), and add it where it is needed.")
+        bool, typer.Option("--residual", help="Also fit r(x), effects that the equations lack; add it if needed.")
     ] = False,
     out: Annotated[
         Path | None,
@@ -43,9 +41,9 @@ def identify(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Fit parameters of a system to measurements, say how well these tell them, and write a config that goes on.
+    """Estimate parameters of a system from measurements, with confidence intervals, and write a config with them.
 
-    Columns are named as states, or outputs, and controls; [deg] and the like behind a name is converted.
+    Columns are named like states, outputs and controls; a unit such as [deg] after a name is converted.
 
     lyapnet identify conf/pendulum_limited.yaml swing.csv --parameters mass,length,damping
     lyapnet identify conf/cartpole_outputs.yaml first.csv second.csv --test third.csv

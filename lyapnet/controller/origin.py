@@ -1,4 +1,4 @@
-"""The file that a controller was loaded from, and what is on record about it."""
+"""The checkpoint that a controller was loaded from, and its recorded evaluation."""
 
 import math
 from contextlib import suppress
@@ -14,7 +14,7 @@ from lyapnet.experiment.checkpoint import KEY, ZOO, located
 
 @dataclass(frozen=True)
 class Origin:
-    """A checkpoint: how it was named, after how many steps of training it was written, and by which version."""
+    """A checkpoint: its path as given, the number of training steps before it, and the version that wrote it."""
 
     path: str
     steps: int | None
@@ -26,7 +26,7 @@ class Origin:
         return cls(str(path), content.get("global_step"), content[KEY].get("version"))
 
     def evaluation(self) -> dict[str, Any]:
-        """The evaluation that its training ended with, or that of the zoo; empty where none is on record."""
+        """The evaluation at the end of its training, or that in the zoo; empty if none is recorded."""
         file = located(self.path)
         with suppress(LyapnetError):
             if file.parent == ZOO:
@@ -37,7 +37,7 @@ class Origin:
 
 
 def number_in(record: dict[str, Any], key: str) -> float | None:
-    """A finite number of a record; None where there is none."""
+    """The finite number for a key of a record; None if there is none."""
     found = record.get(key)
     return float(found) if isinstance(found, int | float) and math.isfinite(found) else None
 

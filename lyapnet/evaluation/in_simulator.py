@@ -1,4 +1,4 @@
-"""Closed loops in MuJoCo's simulator: a controller on a plant with contacts, friction and actuators of its own."""
+"""Closed loops in MuJoCo's simulator, whose model may have contacts, friction and actuators."""
 
 import math
 import os
@@ -19,11 +19,11 @@ from lyapnet.evaluation.references import costs_of_plant
 from lyapnet.task.models.robots import FORCE, RATE, TORQUE
 from lyapnet.value.expansions import in_float64
 
-AS_GOOD = 1.1  # a closed loop succeeds if it costs at most so much as with the model
+AS_GOOD = 1.1  # ratio of the costs in the simulator and with the model up to which a closed loop counts as good
 
 
 class Plant(NamedTuple):
-    """A MuJoCo model with the places of the controller's states and controls in it.
+    """A MuJoCo model with the indices of the controller's states and controls in it.
 
     Args:
         positions: for each state that is a position, (state, index in qpos).
@@ -41,12 +41,12 @@ class Plant(NamedTuple):
 
 
 class SimulatedLoops(NamedTuple):
-    """The closed loops from some states, in the simulator and with the controller's own model.
+    """Closed loops from some states, in the simulator and with the controller's model.
 
     Args:
-        cost: ∫ℓ + φ in the simulator with u held for Δt; infinite where it gave up.
+        cost: ∫ℓ dt + φ in the simulator with u held for Δt; infinite if the simulation became unstable.
         model_cost: the same with the model in continuous time.
-        positions: (N + 1, …) those of all joints of the plant along the first closed loop.
+        positions: positions of all joints in the first closed loop, (N + 1, …).
     """
 
     cost: PerState
@@ -54,7 +54,7 @@ class SimulatedLoops(NamedTuple):
     positions: NDArray
 
     def summary(self) -> dict[str, float]:
-        """Mean costs, their ratio, the largest ratio, and the shares of finite loops and of those within AS_GOOD."""
+        """Mean costs, their ratio, the largest ratio, and the shares of finite and of good loops."""
         ratio = self.cost / self.model_cost
         finite = self.cost.isfinite()
         return {
@@ -108,9 +108,11 @@ def read_plant(path: Path, controller: Controller, drawn: bool = False) -> Plant
     forces = {f"{name}{end}": int(model.jnt_dofadr[j]) for name, j in joints.items() for end in (TORQUE, FORCE)}
     plant = Plant(mujoco, model, [], [], [], [])
     for i, name in enumerate(joined(name) for name in system.state_names):
-        _add(i, name, ((states, plant.positions), (rates, plant.rates)), f"states of the controller in {path.name}")
+        _add_index(
+            i, name, ((states, plant.positions), (rates, plant.rates)), f"states of the controller in {path.name}"
+        )
     for i, name in enumerate(joined(name) for name in system.control_names):
-        _add(
+        _add_index(
             i,
             name,
             ((actuators, plant.actuators), (forces, plant.joints)),
@@ -119,7 +121,7 @@ def read_plant(path: Path, controller: Controller, drawn: bool = False) -> Plant
     return plant
 
 
-def _add(i: int, name: str, places: Any, where: str) -> None:
+def _add_index(i: int, name: str, places: Any, where: str) -> None:
     for known, found in places:
         if name in known:
             found.append((i, known[name]))
@@ -131,31 +133,31 @@ def _add(i: int, name: str, places: Any, where: str) -> None:
 
 @torch.no_grad()
 def simulate(controller: Controller, plant: Plant, x0: State) -> SimulatedLoops:
-    """The closed loops from a batch of states, with u held for Δt, which is divided into steps of the simulator."""
+    """Closed loops from states x0 (b, n), with u held for Δt; the simulator takes several equal steps in each Δt."""
     problem = in_float64(controller.problem)
     policy, horizon, x0 = controller.closed_loop.policy, problem.horizon, x0.double().cpu()
     each = max(1, math.ceil(horizon.dt / float(plant.model.opt.timestep) - 1e-9))
     plant.model.opt.timestep = step = horizon.dt / each
-    states = [_started(plant, row) for row in x0.numpy()]
+    states = [_start(plant, row) for row in x0.numpy()]
     cost, x = torch.zeros(len(x0), dtype=torch.float64), x0
     positions = [states[0].qpos.copy()]
     for n in range(horizon.steps):
         like = x.to(controller.initial_states.lower)
         u = controller.controls.applied(like, policy(like.new_tensor(n * horizon.dt), like)).double()
         for data, control in zip(states, u.numpy(), strict=True):
-            _apply(plant, data, control)
+            _set_controls(plant, data, control)
         for _ in range(each):
             before = problem.cost.running(x, u)
             for data in states:
                 plant.mujoco.mj_step(plant.model, data)
-            x = torch.from_numpy(np.stack([_state_of(plant, data, x0.shape[-1]) for data in states]))
+            x = torch.from_numpy(np.stack([_read_state(plant, data, x0.shape[-1]) for data in states]))
             cost += step * (before + problem.cost.running(x, u)) / 2
         positions.append(states[0].qpos.copy())
     cost = torch.where(cost.isfinite(), cost + problem.cost.terminal(x), torch.inf)
     return SimulatedLoops(cost, costs_of_plant(problem, policy, x0), np.stack(positions))
 
 
-def _started(plant: Plant, x: NDArray) -> Any:
+def _start(plant: Plant, x: NDArray) -> Any:
     data = plant.mujoco.MjData(plant.model)
     for i, place in plant.positions:
         data.qpos[place] = x[i]
@@ -164,15 +166,15 @@ def _started(plant: Plant, x: NDArray) -> Any:
     return data
 
 
-def _apply(plant: Plant, data: Any, u: NDArray) -> None:
+def _set_controls(plant: Plant, data: Any, u: NDArray) -> None:
     for i, place in plant.actuators:
         data.ctrl[place] = u[i]
     for i, place in plant.joints:
         data.qfrc_applied[place] = u[i]
 
 
-def _state_of(plant: Plant, data: Any, n: int) -> NDArray:
-    """x, or NaN where the simulator found an instability and began again."""
+def _read_state(plant: Plant, data: Any, n: int) -> NDArray:
+    """The state x; NaN if the simulator found an instability and reset itself."""
     warnings = plant.mujoco.mjtWarning
     lost = any(data.warning[int(kind)].number for kind in (
         warnings.mjWARN_BADQPOS, warnings.mjWARN_BADQVEL, warnings.mjWARN_BADQACC,

@@ -8,10 +8,10 @@ from lyapnet.base.linear_algebra import apply, norm, solve
 from lyapnet.base.types import Control, ControlMatrix, State
 from lyapnet.task.sets import ControlSet, passed_through
 
-NEWTON_STEPS = 10  # for a multiplier: they converge from one side, and double its digits at each step
+NEWTON_STEPS = 10  # number of steps for a multiplier; they converge monotonically and quadratically
 TINY = 1e-100  # replaces 0 in denominators
-LEAST_NUMBER = 1e-12  # smallest weight or limit that is not taken for a mistake, and the inverse of the largest
-INWARDS = 8  # units of rounding by which projected controls are inside; they are projected from half of it on
+LEAST_NUMBER = 1e-12  # least weight or limit that is accepted, and inverse of the largest
+INWARDS = 8  # units of rounding by which projected controls are inside; those inside by half of it stay as they are
 
 
 class ControlBall(ControlSet):
@@ -59,7 +59,7 @@ class ControlBall(ControlSet):
         return self._inwards(u, torch.finfo(u.dtype).eps)
 
     def _inwards(self, u: Control, unit: float) -> Control:
-        """The same for a unit of rounding."""
+        """The projection with a given unit of rounding."""
         rounding = INWARDS * unit
         within = self.radius * (1 - rounding)
         if u.shape[-1] == 1:
@@ -131,10 +131,10 @@ def _shifted(R: ControlMatrix, b: Control, multiplier: Tensor) -> tuple[Control,
 
 
 def positive_number(name: str, number: float) -> float:
-    """A number > 0 of a set or a cost of controls.
+    """A positive number as a float.
 
     Raises:
-        ValueError: it is none, or so small or large that it is taken for a mistake.
+        ValueError: it is no number between LEAST_NUMBER and its inverse.
     """
     if type(number) not in (int, float) or not LEAST_NUMBER <= number <= 1 / LEAST_NUMBER:
         raise ValueError(f"Expected {name} > 0, got {number!r}; correct it.")

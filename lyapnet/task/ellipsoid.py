@@ -1,4 +1,4 @@
-"""An ellipsoid as a set of controls: a ball, stretched, turned and moved."""
+"""An ellipsoid as a set of controls: an affine image of a ball."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,8 +15,8 @@ from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.sets import finite_numbers
 from lyapnet.task.systems import ControlSystem
 
-ROUNDING = 16  # units of rounding by which controls are inside, relative to the condition of H and the size of c
-LARGEST_CONDITION = 1e5  # of H: float32 has no more digits
+ROUNDING = 16  # units of rounding by which controls are inside, times `spread`
+LARGEST_CONDITION = 1e5  # largest condition number of H; float32 has about 7 digits
 
 
 class ControlEllipsoid(MappedControls, ControlBall):
@@ -52,7 +52,7 @@ class ControlEllipsoid(MappedControls, ControlBall):
             raise ValueError(f"Expected a center of {len(H)} controls, got {center!r}; give one number for each.")
         for name, part in {"shape": H, "inverse": torch.linalg.inv(H), "center": c}.items():
             self.register_buffer(name, part, persistent=False)
-        # how far, in v, the rounding of u may move it, in units of rounding
+        # largest change of v by the rounding of u, in units of rounding
         norm = torch.linalg.matrix_norm
         self.spread: float = float(norm(self.inverse) * (norm(H) + c.norm()))
         self.to(torch.get_default_dtype())

@@ -1,11 +1,11 @@
 """Control sets that are images of a simpler set at each state: u = c(x) + H(x)v for all v of a box or a ball.
 
-A task with such a set is solved in the shares v. It is then a task with the simpler set, which knows no state:
+A task with such a set is solved for v, the shares. It is then a task with the simpler set, which is constant:
 
     f + gu = (f + gc) + (gH)v,   (u − u*)ᵀR(u − u*) = (v − v*)ᵀ HᵀRH (v − v*),   v*(x) = H(x)⁻¹(u* − c(x)).
 
-So everything that differentiates dynamics and costs in x knows how the set moves, and everything that minimises over
-the set has the minimiser of the simpler one.
+So derivatives of dynamics and costs in x include those of c and H, and minimisers over the set are those of the simpler
+one.
 """
 
 import copy
@@ -22,7 +22,7 @@ from lyapnet.task.systems import ControlSystem
 
 
 class MappedControls(ControlSet):
-    """U(x) = {c(x) + H(x)v : v ∈ U₀}; as a set that knows no state, U₀, which a subclass inherits besides."""
+    """U(x) = {c(x) + H(x)v : v ∈ U₀}. A subclass also inherits from the class of U₀, the set of the shares v."""
 
     words: str = "a set of controls that depends on the state"
 
@@ -35,10 +35,10 @@ class MappedControls(ControlSet):
         """MH(x) for a matrix M (*batch, k, m)."""
 
     def of(self, system: ControlSystem) -> "MappedControls":
-        """This set for a system, whose states it may know by name.
+        """This set for a system, with names of states replaced by their indices.
 
         Raises:
-            UsageError: it does not fit the system.
+            UsageError: the set does not fit the system.
         """
         return self
 
@@ -112,10 +112,10 @@ class MappedCost(MadeOfAnother):
 
 
 def mapped(system: ControlSystem, cost: Cost, controls: MappedControls, goal: State) -> tuple[ControlSystem, Cost]:
-    """A system and a cost as functions of the shares; those that are already so stay as they are.
+    """A system and a cost as functions of the shares; those that are so already are returned unchanged.
 
     Args:
-        goal: a typical state (n,), where the cost has no goal.
+        goal: a typical state (n,), for costs without a goal.
     """
     if not isinstance(system, MappedSystem):
         system = MappedSystem(system, controls)
@@ -128,12 +128,12 @@ def mapped(system: ControlSystem, cost: Cost, controls: MappedControls, goal: St
 
 
 def written_system(system: ControlSystem) -> ControlSystem:
-    """The system as a function of u that was given to a problem with mapped controls; else the system itself."""
+    """The system as a function of u from which a system with shares was made; else the system itself."""
     return system.system if isinstance(system, MappedSystem) else system
 
 
 def written_cost(cost: Cost) -> Cost:
-    """The cost as a function of u that was given to a problem with mapped controls; else the cost itself."""
+    """The cost as a function of u from which a cost with shares was made; else the cost itself."""
     if isinstance(cost, MappedCost):
         return cost.cost
     if not isinstance(cost, MadeOfAnother) or (inner := written_cost(cost.cost)) is cost.cost:

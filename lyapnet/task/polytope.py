@@ -1,4 +1,4 @@
-"""A polytope as a set of controls: limits that several controls share."""
+"""A polytope as a set of controls: joint limits of several controls."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,18 +14,19 @@ from lyapnet.base.types import Control, ControlMatrix, State
 from lyapnet.task.sets import ControlSet, finite_numbers, passed_through
 
 MOST_CONTROLS = 4
-MOST_COMBINATIONS = 2000  # of rows that may hold together: each is a linear system for each state
-INWARDS = 16  # units of rounding by which controls are inside, relative to the sizes that a row adds up
-LEAST_WIDTH = 1e-4  # of the radius of a ball in U, relative to its largest control: far above rounding in float32
-SINGULAR = 1e-9  # relative singular value below which rows are taken to be dependent
-ACTIVE = 1e-9  # distance from a row, relative to its sizes, below which it holds a control
+MOST_COMBINATIONS = 2000  # largest number of sets of rows; each takes a linear system for each state
+INWARDS = 16  # units of rounding by which controls are inside, relative to the sum of sizes of a row's terms
+LEAST_WIDTH = 1e-4  # least radius of the largest ball in U, relative to U's size: far above rounding in float32
+SINGULAR = 1e-9  # singular value below which unit rows count as dependent
+ACTIVE = 1e-9  # distance of a control from a row, relative to the sum of sizes, below which the row is active
 
 
 class ControlPolytope(ControlSet):
-    """U = {u : Au ≤ b}, bounded: limits that controls share, such as a power for both.
+    """U = {u : Au ≤ b}, bounded: joint limits of controls, such as a limit of their total power.
 
-    The minimiser of uᵀRu + bᵀu is that of all combinations of at most m independent rows as equations which meets the
-    conditions of an optimum best: u inside, and multipliers ≥ 0. Controls are rounded inwards, also in float32.
+    To minimise uᵀRu + bᵀu, every set of at most m independent rows is taken as equations. The minimiser is the result
+    that satisfies the optimality conditions best: u ∈ U and multipliers ≥ 0. Controls are rounded inwards, also in
+    float32.
 
     Args:
         A: rows (k, m).
@@ -36,12 +37,12 @@ class ControlPolytope(ControlSet):
             MOST_COMBINATIONS combinations of rows.
     """
 
-    A: Float[Tensor, "k m"]  # of unit rows
+    A: Float[Tensor, "k m"]  # rows of length 1
     b: Float[Tensor, " k"]
-    lower: Float[Tensor, " m"]  # of the smallest box around U
+    lower: Float[Tensor, " m"]  # corners of the smallest box around U
     upper: Float[Tensor, " m"]
-    inner: Float[Tensor, " m"]  # the centre of a largest ball in U
-    rows: Int[Tensor, "s m"]  # of each combination; k stands for none
+    inner: Float[Tensor, " m"]  # centre of a largest ball in U
+    rows: Int[Tensor, "s m"]  # indices of rows in each of s sets, filled up with k for none
 
     def __init__(self, A: Sequence[Any], b: Sequence[float]):
         super().__init__()
@@ -78,7 +79,7 @@ class ControlPolytope(ControlSet):
 
     @property
     def sizes(self) -> Float[Tensor, " k"]:
-        """What the terms of a row may add up to: |A| max |u| + |b|."""
+        """A bound of the sum of sizes of each row's terms: |A| max |u| + |b|."""
         return self.A.abs() @ torch.maximum(self.lower.abs(), self.upper.abs()) + self.b.abs()
 
     @property
@@ -90,7 +91,7 @@ class ControlPolytope(ControlSet):
         return passed_through(self, dtype)
 
     def applied(self, x: State, u: Control) -> Control:
-        return self._pulled(u.double()).to(u) if self.rounding > torch.finfo(u.dtype).eps else u
+        return self._pull_inside(u.double()).to(u) if self.rounding > torch.finfo(u.dtype).eps else u
 
     def excess(self, u: Control) -> Tensor:
         return (apply(self.A, u) - self.b) / self.sizes
@@ -101,7 +102,7 @@ class ControlPolytope(ControlSet):
         m, known = b.shape[-1], R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         if m != A.shape[1]:
             raise ValueError(f"Expected controls of {A.shape[1]}, as A has columns, got {m}; give one for each.")
-        each = (slice(None), *[None] * (b.ndim - 1))  # the first axis has the combinations
+        each = (slice(None), *[None] * (b.ndim - 1))  # the first axis is that of the s sets of rows
         chosen = torch.cat([A, torch.zeros_like(A[:1])])[self.rows][each]  # (s, *1, m, m)
         held = torch.cat([sides, torch.zeros_like(sides[:1])])[self.rows][each]
         none = torch.diag_embed((self.rows == len(A)).to(b))[each]
@@ -116,10 +117,10 @@ class ControlPolytope(ControlSet):
         off = torch.maximum(outside, (-multiplier / steep.where(steep > 0, 1.0)).amax(-1))
         best = off.where(off.isfinite(), torch.inf).argmin(0)
         u = u.gather(0, best[None, ..., None].expand(1, *b.shape))[0]
-        return torch.where(known[..., None], self._pulled(u), torch.nan).to(given)
+        return torch.where(known[..., None], self._pull_inside(u), torch.nan).to(given)
 
-    def _pulled(self, u: Control) -> Control:
-        """u, moved towards an inner point where it is outside by rounding, in float64."""
+    def _pull_inside(self, u: Control) -> Control:
+        """u, moved towards the inner point if rounding put it outside, in float64."""
         A, room = self.A.double(), self.within - self.A.double() @ self.inner.double()
         beyond = apply(A, u.detach() - self.inner.double())
         share = (room / torch.maximum(beyond, room)).amin(-1, keepdim=True)
@@ -133,7 +134,7 @@ class ControlPolytope(ControlSet):
         return torch.where(self.contains(u)[..., None], u, self.minimise(one.expand(*u.shape, u.shape[-1]), -2 * u))
 
     def tangents(self, u: Control) -> Float[Tensor, "*batch m m"]:
-        """The projections onto the directions in which a control may move along the rows that hold it."""
+        """Projections onto the directions that are orthogonal to the active rows."""
         A = self.A.to(u)
         holds = apply(A, u) >= (self.within - ACTIVE * self.sizes).to(u)
         normals = holds[..., None].to(u) * A
@@ -176,7 +177,7 @@ def _box_around(A: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _combinations(A: Tensor) -> Tensor:
-    """The rows of all combinations of at most m independent rows of A (k, m), filled up by k."""
+    """All sets of at most m independent rows of A (k, m), as indices (s, m) filled up with k."""
     k, m = A.shape
     found = []
     for count in range(min(k, m) + 1):

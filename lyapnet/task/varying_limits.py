@@ -1,4 +1,4 @@
-"""Limits of controls that depend on the state: motors whose torque falls with speed, thrust that falls with height."""
+"""Limits of controls that depend on the state, such as those of a motor whose torque falls with its speed."""
 
 import copy
 from abc import abstractmethod
@@ -16,15 +16,15 @@ from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.sets import ControlBox, finite_numbers, passed_through
 from lyapnet.task.systems import ControlSystem
 
-TRIED = 64  # states at which a user's function is tested
-ROUNDING = 16  # units of rounding by which limits from a table are inside of it, relative to the sizes that it adds up
+TRIED = 64  # number of states at which a user's function is tested
+ROUNDING = 16  # units of rounding by which limits are inside those of the table, relative to the sum of sizes
 
 
 class VaryingLimits(MappedControls, ControlBox):
-    """U(x) = {u : lower(x) ≤ u ≤ upper(x)}; as a set that knows no state, the shares v with −1 ≤ v ≤ 1.
+    """U(x) = {u : lower(x) ≤ u ≤ upper(x)}, with shares −1 ≤ v ≤ 1.
 
-    A subclass implements `limits_at` with torch operations on tensors of any leading shape. Where a slope of the limits
-    jumps, derivatives are those that torch computes there, and second derivatives do not see the jump.
+    A subclass implements `limits_at` with torch operations on tensors of any leading shape. Where the slope of a limit
+    jumps, first derivatives are those of torch, and second derivatives ignore the jump.
     """
 
     words: str = "limits that depend on the state"
@@ -44,7 +44,7 @@ class VaryingLimits(MappedControls, ControlBox):
         """See ControlSet.rounded_for.
 
         Raises:
-            ExportError: nothing is known of the rounding of `limits_at`.
+            ExportError: the rounding of `limits_at` is not known.
         """
         raise ExportError(
             f"Expected limits of controls from a table, or the precision of the controller, got "
@@ -92,7 +92,7 @@ class VaryingLimits(MappedControls, ControlBox):
 
 
 class LimitTable(VaryingLimits):
-    """Limits that are straight between the entries of a table over one state, and constant beyond its ends.
+    """Limits by linear interpolation in a table over one state, constant beyond its ends.
 
     At an entry, where the slope jumps, the derivative is the slope before it. Limits are rounded inwards: those
     computed in float32 never exceed those of the table as it is written.
@@ -109,9 +109,9 @@ class LimitTable(VaryingLimits):
 
     nodes: Float[Tensor, " k"]  # x₀ to x_{k−1}, where a slope begins
     last: Float[Tensor, "1"]  # x_k
-    first: Float[Tensor, "2 m"]  # the limits at x₀, lower ones first
+    first: Float[Tensor, "2 m"]  # (lower, upper) at x₀
     bends: Float[Tensor, "2 m k"]  # changes of their slopes at the nodes
-    sizes: Float[Tensor, "2 m"]  # of the numbers that are added up
+    sizes: Float[Tensor, "2 m"]  # bound of the sum of sizes of the terms of a limit
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class LimitTable(VaryingLimits):
     ):
         super().__init__()
         self.state = state
-        self.index: int | None = None  # of the state in the system
+        self.index: int | None = None  # index of the state in the system
         self.count = 1  # number of controls
         nodes, top = finite_numbers("at", at), finite_numbers("upper", upper)
         bottom = -top if lower is None else finite_numbers("lower", lower)
@@ -167,7 +167,7 @@ class LimitTable(VaryingLimits):
         return passed_through(self, dtype)
 
     def limits_at(self, x: State) -> tuple[Control, Control]:
-        assert self.index is not None  # a problem binds it to its system
+        assert self.index is not None  # set by `of`
         ramps = torch.relu(x[..., self.index, None].clamp(max=self.last) - self.nodes)
         low, high = (self.first[k] + (ramps[..., None, :] * self.bends[k]).sum(-1) for k in (0, 1))
         room, shape = ROUNDING * self.rounding * self.sizes, (*x.shape[:-1], self.count)

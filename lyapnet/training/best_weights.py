@@ -1,4 +1,4 @@
-"""Training that has become worse returns to its best weights, with a smaller learning rate."""
+"""Returns a training that has become worse to its best weights, with a smaller learning rate."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,10 +13,10 @@ from lyapnet.training.curves import members_of
 from lyapnet.training.learner import Learner, number_over_processes
 
 RATE_DIVISOR = 3.0  # each return divides the learning rate by this
-WORSE_BY = 0.01  # relative cost above that of the best weights from which on training counts as worse
-WORSE_FOR = 60  # steps of this before it returns
-DIVERGENCE_COST_RATIO = 2.0  # cost relative to that of the best weights from which on it returns at once
-COMPARED_SHARE = 0.9  # cheapest validation states in that cost; without the few that a kink of V makes expensive
+WORSE_BY = 0.01  # relative increase of the cost, from the best weights, above which training counts as worse
+WORSE_FOR = 60  # number of steps for which training is worse before it returns
+DIVERGENCE_COST_RATIO = 2.0  # cost relative to that of the best weights above which it returns at once
+COMPARED_SHARE = 0.9  # share of validation states, the cheapest, in that cost; the others may be near a kink of V
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Best:
 
 
 class ReturnToBest(Callback):
-    """Returns a member to its best weights once its closed loops have become dearer, and at the end of its training.
+    """Returns a member to its best weights if its closed loops cost more, during or at the end of its training.
 
     The best weights are those of the least validation loss, as in best.ckpt. Training is worse where the mean cost of
     the validation states exceeds theirs by more than WORSE_BY. After WORSE_FOR steps of this, or at once if the
@@ -46,9 +46,9 @@ class ReturnToBest(Callback):
     V(0, x₀) may be nearly the same on all of X₀.
 
     Args:
-        returns_if_worse: whether it returns after WORSE_FOR steps too. A training from random weights goes up and down
+        returns_if_worse: whether it also returns after WORSE_FOR steps. Costs of a training from random weights vary
             by more than WORSE_BY.
-        say: shows a line.
+        say: prints a line.
         note: adds a return to the run's record.
     """
 

@@ -1,4 +1,4 @@
-"""Optimal trajectories from states that a law visits at later times, where those from X₀ say nothing about V."""
+"""Optimal trajectories from states that a law visits at later times, far from the optimal trajectories from X₀."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from lyapnet.value.expansions import (
     sizes,
 )
 
-LOST_EXCESS = 0.02  # excess of a law's cost over the optimum, relative to it, from which its states are looked at
-MAX_LOST_LOOPS = 96  # closed loops whose states are looked at
-TIMES = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)  # shares of the horizon after which searches begin
+LOST_EXCESS = 0.02  # cost of a closed loop above the optimum, relative to it, above which its states are used
+MAX_LOST_LOOPS = 96  # largest number of closed loops whose states are used
+TIMES = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)  # times of these states, as shares of the horizon
 
 
 class LaterOptimum(NamedTuple):
@@ -44,9 +44,9 @@ def later_optima(
 ) -> list[LaterOptimum]:
     """Optimal trajectories from states of closed loops that cost more than their optimum.
 
-    Near an optimum V is known from its expansion. A law that has left it meets states where V is only extrapolated, and
-    acts on that: it may turn a few steps too early, and never come back. The optimum from such a state is found anew,
-    with the laws of the optima nearest to it at that time as initial guesses, and with the controls of the loop itself.
+    Near an optimal trajectory V is known from its expansion. A law that has left it visits states where V is only
+    extrapolated, and may be wrong there. The optimum from such a state is computed, with the laws of the nearest optima
+    at that time as initial guesses, and with the controls of the closed loop.
 
     Args:
         optimum: the optima from the initial states of the closed loops.

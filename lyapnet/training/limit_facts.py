@@ -1,4 +1,4 @@
-"""How much of X₀ the limits of the controls can hold near the goal, by the linear model there."""
+"""The share of X₀ that controls within their limits can hold near the goal, by the linear model there."""
 
 import math
 from collections.abc import Iterator
@@ -15,18 +15,18 @@ from lyapnet.training.config_facts import Fact
 from lyapnet.value.expansions import in_float64
 from lyapnet.value.linearisation import Linearisation, linearised
 
-STATES = 4096  # random states of X₀ whose share is given
-DEMANDING = 0.5  # part of the limits that holding the states of X₀ may take before a line says so
-FAR = 1e9  # distance of a control whose projection is the end of U in its direction
-ROUNDING = 1e-9  # relative size below which an imaginary part, or the slope of a control, counts as zero
+STATES = 4096  # number of random states of X₀ from which the share is estimated
+DEMANDING = 0.5  # part of the limits above which the need of states of X₀ is reported
+FAR = 1e9  # size of a control whose projection onto U is taken for the end of U in its direction
+ROUNDING = 1e-9  # relative size below which an imaginary part, or the effect of the controls, counts as zero
 
 
 class Demand(NamedTuple):
-    """What it takes to hold states against a growing mode.
+    """The part of the limits that is needed to stop a growing mode.
 
     Args:
         mode: its eigenvalue in 1/s.
-        taken: for each state the part of the limits; above 1 the mode grows whatever u is.
+        taken: this part for each state; above 1 the mode grows for every u.
     """
 
     mode: float
@@ -34,21 +34,21 @@ class Demand(NamedTuple):
 
 
 def limit_facts(problem: Problem) -> list[Fact]:
-    """The share of X₀ that no controls within their limits hold near the goal, by the linear model there.
+    """The share of X₀ that no controls within their limits can hold near the goal, by the linear model there.
 
     For a real eigenvalue λ > 0 of A with left eigenvector l, and δ = x − x*,
 
         d/dt lᵀδ = λ lᵀδ + lᵀF(x*, u*) + lᵀB(u − u*).
 
-    Where the first two terms outweigh the last one for every u ∈ U, lᵀδ grows for ever, and their excess as e^{λt}. To
-    hold the linear model it is therefore necessary that they do not; that is not sufficient, and the system itself may
-    hold more or less. Modes that grow less than e-fold within T are left out.
+    If the first two terms together are larger than the last one for every u ∈ U, lᵀδ grows for ever, and the difference
+    grows like e^{λt}. So it is necessary for the linear model that they are not larger. This is not sufficient, and the
+    nonlinear system may differ. Modes that grow by less than a factor e within T are left out.
     """
     if not problem.controls.limited or not problem.has_goal or problem.follows_reference:
         return []
     problem = in_float64(problem)
     around = linearised(problem)
-    demands = [] if around.missing is not None else list(_demands(problem, around))
+    demands = [] if around.missing is not None else list(_find_demands(problem, around))
     if not demands:
         return []
     hardest = max(demands, key=lambda demand: float(demand.taken.max()))
@@ -68,8 +68,8 @@ def limit_facts(problem: Problem) -> list[Fact]:
     return [Fact("limits", found, "a smaller X₀ or wider controls, if all of X₀ is to stay near the goal")]
 
 
-def _demands(problem: Problem, around: Linearisation) -> Iterator[Demand]:
-    """The demands of the real growing modes that the controls reach, for random states of X₀."""
+def _find_demands(problem: Problem, around: Linearisation) -> Iterator[Demand]:
+    """The demands of all growing modes with real eigenvalues that the controls act on, for random states of X₀."""
     moving, controls = moving_states(problem.system), problem.controls
     A, B = around.A[moving][:, moving], around.g[moving]
     rest = (around.f + apply(around.g, problem.rest))[moving]

@@ -1,4 +1,4 @@
-"""min over u ∈ U of uᵀWu + bᵀu + s(u), and where it is: one operator of traces, so that bounds know it as a minimum."""
+"""argmin and min over u ∈ U of uᵀWu + bᵀu + s(u), and an operator for them in traces, which bounds can recognise."""
 
 import copy
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
 
 class Minimum(NamedTuple):
-    """The best control, and what is minimised there."""
+    """The minimiser and the minimum."""
 
     u: Control
     value: PerState  # uᵀWu + bᵀu + s(u), (*batch,)
@@ -30,14 +30,14 @@ def best_control(costs: ControlCosts | None, controls: ControlSet, W: ControlMat
 
 
 def least_over(costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum:
-    """The same with the minimum."""
+    """The minimiser, as in `best_control`, and the minimum."""
     u = best_control(costs, controls, W, b)
     value = ((apply(W, u) + b) * u).sum(-1)
     return Minimum(u, value if costs is None else value + costs(u))
 
 
 def is_quadratic_between_limits(costs: ControlCosts | None, controls: ControlSet) -> bool:
-    """Whether no s is paid and U is neither ball nor polytope, so that bounds read the best control as written."""
+    """Whether s = 0 and U is neither ball nor polytope; then bounds need no operator for the best control."""
     return costs is None and not isinstance(controls, ControlBall | ControlPolytope)
 
 
@@ -55,7 +55,7 @@ class Known(NamedTuple):
 
 
 def description(costs: ControlCosts | None, controls: ControlSet) -> str | None:
-    """All that defines s and U, as text; None if a class is not lyapnet's own."""
+    """A text that defines s and U completely; None for other classes than those that the operator supports."""
     parts, controls = [] if costs is None else [*costs.costs], controls.shares
     own = {*CONTROL_COSTS.values()}.issuperset(map(type, parts)) and type(costs) in (ControlCosts, type(None))
     if not own or type(controls) not in (ControlBall, ControlBox, Unbounded) or (costs and float(costs.softness)):
@@ -72,7 +72,7 @@ def _numbers(part: nn.Module) -> Iterator[str]:
 
 
 def traced_minimum(costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum | None:
-    """The minimum by the operator; None unless a trace with this operator is being made, and it knows s and U."""
+    """The minimum by the operator; None unless a trace with this operator is being made, and it supports s and U."""
     if not are_operators(MINIMA) or is_quadratic_between_limits(costs, controls) or is_transformed(b):
         return None
     with torch._C.DisableTorchFunction(), _disable_current_modes():  # numbers, not operations of the trace
@@ -88,7 +88,7 @@ _known = dict[str, dict[torch.device, Known]]()
 
 
 def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
-    """The description of s and U, by which the operator finds them in this process; None if it has none."""
+    """Store s and U for the operator in this process; return their description, or None if they have none."""
     named = description(costs, controls)
     if named is not None and named not in _known:
         _known[named] = {_CPU: Known(costs, controls.shares).to(_CPU)}
@@ -96,7 +96,7 @@ def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
 
 
 def known_as(named: str, device: torch.device) -> Known:
-    """s and U with a description that `make_known` has given in this process."""
+    """s and U by a description from `make_known` in this process."""
     copies = _known[named]
     if device not in copies:
         copies[device] = copies[_CPU].to(device)

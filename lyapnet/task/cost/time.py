@@ -1,4 +1,4 @@
-"""A cost of time: so much per second until the state is near its goal."""
+"""A cost of time: a constant rate until the state is near its goal."""
 
 import math
 
@@ -14,16 +14,16 @@ from lyapnet.task.cost.made_of_another import MadeOfAnother
 class TimeCost(MadeOfAnother):
     """Another cost plus k (1 − exp(−d²/2)) per second, d² = Σ_i ((x_i − x*_i)/w_i)²: the time until d ≤ 1.
 
-    Far from the goal it is k per second, at d = 3 still 0.99 k. Near the goal it is k d²/2, so that V is smooth there
-    and the law ends as a linear regulator. With k = 1 and a small R, V is about the time to go under limits.
+    Far from the goal it is k per second (0.99 k at d = 3). Near the goal it is k d²/2, so that V is smooth there, and
+    the law becomes a linear regulator. With k = 1, limited controls and a small R, V is about the time to the goal.
 
-    Its slope vanishes where the goal is far. Optima are therefore sought with wider w first, see `widening`.
+    Far from the goal its slope vanishes. Optima are therefore computed with larger w first, see `widening`.
 
     Args:
         cost: the other cost, with its goal at the origin.
         near: a cost with q = d²/2 of n states.
         per_second: k.
-        n: number of states; others after them are parameters.
+        n: number of states; entries of x after them are parameters.
 
     Raises:
         ValueError: k is not positive.
@@ -32,7 +32,7 @@ class TimeCost(MadeOfAnother):
     near: Cost
     per_second: float
     n: int
-    widening: Float[Tensor, ""]  # factor of w, 1 but while optima are sought
+    widening: Float[Tensor, ""]  # factor of w; other than 1 only during the search for optima
 
     def __init__(self, cost: Cost, near: Cost, per_second: float, n: int):
         super().__init__(cost)
@@ -50,7 +50,7 @@ class TimeCost(MadeOfAnother):
 
 
 def time_cost_of(cost: Cost) -> TimeCost | None:
-    """The cost of time of which a cost is made; None if it has none."""
+    """The cost of time that a cost contains; None if it has none."""
     while isinstance(cost, MadeOfAnother):
         if isinstance(cost, TimeCost):
             return cost
@@ -59,7 +59,7 @@ def time_cost_of(cost: Cost) -> TimeCost | None:
 
 
 def squared_distance(cost: Cost, x: State) -> PerState:
-    """d² of a cost that is made of a cost of time."""
+    """d² of a cost that contains a cost of time."""
     time = time_cost_of(cost)
     assert time is not None
     return 2 * time.near.state(cost.from_goal(x)[..., : time.n])

@@ -1,11 +1,11 @@
 """Contact as parts of f(x): a compliant normal force and regularised friction, smooth by a stated length and speed.
 
-Both are means over a blur: with ξ of density ¾(1 − ξ²) on [−1, 1],
+Both are averages of the sharp functions: with random ξ of density ¾(1 − ξ²) on [−1, 1],
 
-    (z)₊ = E max(0, z + ξ),    sgn(z) = E sign(z + ξ),
+    (z)₊ = E max(0, z + ξ),    sgn(z) = E sign(z + ξ).
 
-which are polynomials for |z| < 1, and max(0, z) and sign(z) themselves elsewhere. (z)₊ has two continuous derivatives,
-sgn(z) has one. Only clamp, products and sums occur, so certificates, C and CasADi know them.
+These are polynomials for |z| < 1, and equal max(0, z) and sign(z) elsewhere. (z)₊ has two continuous derivatives,
+sgn(z) has one. They consist of clamp, products and sums, which certificates, C and CasADi support.
 """
 
 import torch
@@ -21,17 +21,17 @@ def normal_force(
 ) -> Tensor:
     """The force by which two bodies push each other apart, N = k ℓ(−d/ℓ)₊ max(0, 1 − c ḋ) ≥ 0.
 
-    It is Hunt and Crossley's force, with the depth max(0, −d) rounded within ±ℓ of touching. It differs from the sharp
-    one by at most 3kℓ/16, at d = 0, and nowhere that |d| ≥ ℓ. The slope by d is between −k and 0, at c = 0. Without
-    damping it conserves energy; with c > 0 it only takes energy away, and a body that meets another at a speed v leaves
-    it at about v(1 − ⅔ c v).
+    It is Hunt and Crossley's force, with the depth max(0, −d) made smooth for |d| < ℓ. It differs from the sharp force
+    by at most 3kℓ/16, at d = 0, and is equal to it for |d| ≥ ℓ. For c = 0 its derivative by d is between −k and 0.
+    Without damping it conserves energy; with c > 0 it only takes energy away, and a body that meets another at a speed
+    v leaves it at about v(1 − ⅔ c v).
 
     Args:
         gap: d in m, negative where the bodies overlap, (*batch,).
         gap_rate: ḋ in m/s, (*batch,).
         stiffness: k in N/m.
         damping: c in s/m.
-        length: ℓ in m, positive; a number, or a tensor as a parameter of a family is.
+        length: ℓ in m, positive; a number, or a tensor if it is a parameter of a family.
 
     Returns:
         N in N, (*batch,); it never pulls.
@@ -47,16 +47,16 @@ def normal_force(
 
 
 def friction_force(slip: Tensor, normal: Tensor, coefficient: Number, speed: Number = 1e-2) -> Tensor:
-    """Coulomb's friction on a body that slips, −μN sgn(v/v_s), in the direction of v.
+    """Coulomb friction on a sliding body, −μN sgn(v/v_s), counted in the direction of v.
 
-    It is Coulomb's force exactly where |v| ≥ v_s, and never adds energy. Within ±v_s it is viscous, with the slope
-    −3μN/(2v_s) at rest: what should stick creeps, at about ⅔ v_s F/(μN) under a small load F.
+    It is exactly Coulomb's force for |v| ≥ v_s, and never adds energy. For |v| < v_s it is viscous, with the slope
+    −3μN/(2v_s) at v = 0: a body that should stick creeps, at about ⅔ v_s F/(μN) under a small load F.
 
     Args:
-        slip: v, speed of the body relative to what it rubs on, in m/s, (*batch,).
+        slip: v, speed of the body relative to the other one in m/s, (*batch,).
         normal: N ≥ 0 in N, (*batch,).
         coefficient: μ.
-        speed: v_s in m/s, positive; a number, or a tensor as a parameter of a family is.
+        speed: v_s in m/s, positive; a number, or a tensor if it is a parameter of a family.
 
     Returns:
         the force in N, (*batch,).
@@ -88,10 +88,10 @@ def _require_positive(name: str, value: Number) -> None:
 
 
 def variable_lengths(module: nn.Module) -> list[tuple[Tensor, float]]:
-    """Make the lengths of all contacts in a module buffers, and return each with its value.
+    """Turn the smoothing lengths of all contacts in a module into buffers; return (buffer, value) for each.
 
     Args:
-        module: a copy, such as of a problem; its systems name these parameters in `contact_lengths`.
+        module: for example a copy of a problem; its systems name these lengths in `contact_lengths`.
     """
     found = list[tuple[Tensor, float]]()
     for system in module.modules():

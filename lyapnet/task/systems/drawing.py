@@ -1,4 +1,4 @@
-"""Shapes by equations: what a system of equations looks like in a state, as text that is read and never run."""
+"""Drawings of systems of equations: the shapes for a state, from text that is parsed and never executed."""
 
 import ast
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +15,9 @@ class Kind(NamedTuple):
     """A kind of shape.
 
     Args:
-        make: its shape from points (x, y), and from the radius of a disk.
+        make: makes a shape from points (x, y), for a disk followed by its radius.
         points: least number of points.
-        more: whether there may be more of them.
+        more: whether more points are allowed.
         radius: whether a radius follows the points.
     """
 
@@ -37,25 +37,27 @@ KINDS = {
 
 
 class Drawing(Formulas):
-    """The shapes of a state, by lines `NAME = expression` and, with expressions for all numbers,
+    """The shapes for a state, from lines `NAME = expression` and lines of the form
 
         line(x, y, x, y, …)  faint(x, y, x, y, …)  polygon(x, y, x, y, x, y, …)  disk(x, y, radius)  arrow(x, y, x, y)
 
+    where all numbers are expressions.
+
     Args:
         text: these lines.
-        names: the numbers that are given: states, controls and parameters.
+        names: names of states, controls and parameters.
 
     Raises:
-        UsageError: a line is neither, or a shape has another count of numbers.
+        UsageError: a line has neither form, or a shape has a wrong count of numbers.
     """
 
     def __init__(self, text: str, names: Sequence[str]):
-        self.shapes: list[tuple[str, list[int]]] = []  # each kind with the places of its numbers
+        self.shapes: list[tuple[str, list[int]]] = []  # (kind, places of its numbers among the results of formulas)
         super().__init__(text, names, (), (), "drawing")
 
     def shapes_at(self, values: Mapping[str, float]) -> list[Shape]:
-        """The shapes, in metres, at given numbers."""
-        found = self._computed(values, {place for _, each in self.shapes for place in each}, torch.tensor(0.0))
+        """The shapes, in metres, for values of the names."""
+        found = self._compute(values, {place for _, each in self.shapes for place in each}, torch.tensor(0.0))
         return [_shape(KINDS[kind], [float(found[place]) for place in each]) for kind, each in self.shapes]
 
     def _read_line(self, line: str, place: str, results: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Systems whose dynamics are equations in a text, which a config has, or which a model of another program became."""
+"""Systems whose dynamics are given as equations in text, from a config or converted from a model in another format."""
 
 import functools
 import inspect
@@ -22,11 +22,11 @@ class Definition(NamedTuple):
 
     Args:
         equations: a line `der(state) = expression` for each state, and lines `name = expression` before them.
-        states, controls: (name, unit) of each, in their order. A name with spaces has _ for them in the equations.
+        states, controls: (name, unit) of each, in order; equations write _ for spaces in names.
         parameters: their names.
         angles: names of the states that are angles in rad.
-        title: what the system is called in tables.
-        drawing: its shapes, as of lyapnet.task.systems.drawing; empty: none.
+        title: the name of the system in tables.
+        drawing: text for lyapnet.task.systems.drawing.Drawing; empty: no drawing.
     """
 
     equations: str
@@ -46,8 +46,8 @@ class Definition(NamedTuple):
 class EquationSystem(ControlSystem):
     """ẋ = F(x, u; p) by equations; `system_class` makes the class of a definition, whose arguments are p.
 
-    It is control-affine if the operations show it: ẋ = c + Σ b_j u_j with c and b_j free of u. f and g are then c and
-    b, read off the same equations. A parameter is an attribute, and so may vary in a family, or untold.
+    It is control-affine if this follows from the operations: ẋ = c + Σ b_j u_j, where c and b_j do not depend on u.
+    Then f = c and g = b, from the same equations. Parameters are attributes, so they may vary as for other systems.
 
     Args:
         parameters: p by name, in SI units.
@@ -110,18 +110,18 @@ class EquationSystem(ControlSystem):
         return self.drawing.shapes_at(dict(zip(self.definition.names, values, strict=True)))
 
     def _values(self, x: State, u: Sequence[Number]) -> dict[str, Number]:
-        """The numbers that the equations name."""
+        """The value of each name in the equations."""
         parameters = (getattr(self, self.attribute_of(name)) for name in self.definition.parameters)
         return dict(zip(self.definition.names, (*x.unbind(-1), *u, *parameters), strict=True))
 
     def __reduce__(self) -> Any:
-        """For copies in other processes, which find the class by its definition."""
+        """Support pickling: another process makes the class from its definition."""
         return _without_init, (self.definition,), self.__dict__
 
 
 @functools.cache
 def system_class(definition: Definition) -> type[EquationSystem]:
-    """The class of the systems with these equations, read once; its constructor takes their parameters by name.
+    """The class of systems with these equations; its constructor takes the parameters by name.
 
     Raises:
         UsageError: there are no states or controls, the equations cannot be read, or a state has none.
@@ -148,7 +148,7 @@ def defined(
     equations: str, states: Mapping[str, str], controls: Mapping[str, str], parameters: Sequence[str] = (),
     angles: Sequence[str] = (), title: str = "Equations", drawing: str = "",
 ) -> type[EquationSystem]:  # fmt: skip
-    """The class of the systems with these equations, from names and units in mappings."""
+    """The class of systems with these equations; states and controls map names to units."""
     named = [tuple((name, unit or "") for name, unit in entries.items()) for entries in (states, controls)]
     return system_class(Definition(equations, named[0], named[1], tuple(parameters), tuple(angles), title, drawing))
 

@@ -1,4 +1,4 @@
-"""Formulas as text, such as `der(rate) = -9.81/length*sin(angle)`, read as torch operations without running them.
+"""Formulas as text, such as `der(rate) = -9.81/length*sin(angle)`, parsed into torch operations, never executed.
 
 A text has one assignment in each line: `name = expression` for an intermediate result, `der(state) = expression` for
 the derivative of a state. Expressions have numbers, names, + - * / **, comparisons, and, or, not, and the functions
@@ -28,9 +28,9 @@ class Operation(NamedTuple):
 
     Args:
         of_tensors: its function in torch.
-        of_numbers: its function in NumPy, for operands that are known before any state is.
-        operands: how many it takes.
-        tensors: how many of them, the first ones, it needs as tensors; None: all.
+        of_numbers: its function in NumPy, for operands that are all numbers.
+        operands: number of operands.
+        tensors: number of operands, from the first one, that have to be tensors; None: all.
     """
 
     of_tensors: Callable[..., Any]
@@ -44,7 +44,7 @@ def _copysign(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _on_numbers(function: Callable[..., Tensor]) -> Callable[..., float]:
-    """A function of tensors, for numbers; the parameters of a contact are checked as numbers."""
+    """A function of two tensors and of parameters, as a function of numbers."""
     return lambda first, second, *rest: float(function(torch.tensor(first), torch.tensor(second), *map(float, rest)))
 
 
@@ -102,21 +102,23 @@ _OPERATIONS: dict[str, Operation] = {**FUNCTIONS, **_COMPARISONS, **_LOGICAL, **
 
 
 class Instruction(NamedTuple):
-    """An operation on earlier results; operands are their places."""
+    """An operation; its operands are the places of earlier results."""
 
     operation: str
     operands: tuple[int, ...]
 
 
 class Formulas:
-    """Functions of named numbers, as a flat list of operations in which each expression stands once.
+    """Functions of named numbers, as a list of operations in which equal expressions occur once.
+
+    Names, constants and results of operations have places: consecutive integers.
 
     Args:
         text: the lines of assignments.
-        names: the numbers that are given: states, controls and parameters.
-        results: names that the text has to define, `der(name)` included, in the order of the results.
-        controls: those of the names in which the results may be affine.
-        where: what the text is called in messages.
+        names: names of states, controls and parameters.
+        results: names that the text has to define, such as `der(state)`, in the order of the results.
+        controls: those of the names for which `affine` says whether the results are affine in them.
+        where: the name of the text in messages.
 
     Raises:
         UsageError: a line is no such assignment, or a name is unknown, or missing, or assigned twice.
@@ -139,45 +141,45 @@ class Formulas:
         del self._known, self._places
         self.controls: tuple[str, ...] = tuple(controls)
         self.affine: bool
-        self._moved, self._factors, self.affine = self._dependence()
+        self._moved, self._factors, self.affine = self._find_dependence()
 
     def __call__(self, values: Mapping[str, Number], like: Tensor, only: Collection[int] | None = None) -> list[Tensor]:
-        """The results as tensors (*batch,), at given numbers.
+        """The results as tensors (*batch,).
 
         Args:
-            values: each name's number or tensor (*batch,).
+            values: name ↦ number or tensor (*batch,).
             like: a tensor of the shape, type and device of the results.
-            only: which results, by their index; None: all.
+            only: indices of the results to compute; None: all.
         """
         chosen = [place for k, place in enumerate(self.results) if only is None or k in only]
-        found = self._computed(values, chosen, like)
-        return [_filled(found[place], like) for place in chosen]
+        found = self._compute(values, chosen, like)
+        return [_fill(found[place], like) for place in chosen]
 
     def names_at(self, places: Mapping[str, int]) -> set[str]:
-        """The names that stand alone as an operand of some operations: operation ↦ which operand, from 0."""
+        """The names that are themselves an operand of some operations; places: operation ↦ operand, from 0."""
         used = {operands[places[each]] for each, operands in self.instructions.values() if each in places}
         return {self.names[place] for place in used if place < len(self.names)}
 
     def slopes(self, values: Mapping[str, Number], like: Tensor) -> list[list[Tensor]]:
-        """[b_1, …, b_m] of each result c + Σ_j b_j u_j, if they are affine; what b needs alone is computed."""
+        """[b_1, …, b_m] of each result c + Σ_j b_j u_j, if they are affine; computes only what b depends on."""
         slopes: dict[int, dict[int, Number]] = {self.names.index(u): {j: 1.0} for j, u in enumerate(self.controls)}
-        found = self._computed({k: v for k, v in values.items() if k not in self.controls}, self._factors, like)
+        found = self._compute({k: v for k, v in values.items() if k not in self.controls}, self._factors, like)
         for place in self._moved:
             operation, operands = self.instructions[place]
             slopes[place] = _slopes(
                 operation, [slopes.get(k, {}) for k in operands], [found.get(k, 0.0) for k in operands], like
             )
         columns = range(len(self.controls))
-        return [[_filled(slopes.get(place, {}).get(j, 0.0), like) for j in columns] for place in self.results]
+        return [[_fill(slopes.get(place, {}).get(j, 0.0), like) for j in columns] for place in self.results]
 
-    def _dependence(self) -> tuple[list[int], set[int], bool]:
-        """The instructions that depend on u, the places that scale their slopes, and whether all results are affine.
+    def _find_dependence(self) -> tuple[list[int], set[int], bool]:
+        """(places of instructions that depend on u, places of their factors, whether all results are affine in u).
 
-        The operations alone decide, the same for all values.
+        This follows from the operations alone, for all values.
         """
         moved, factors = list[int](), set[int]()
         depends = {self.names.index(u) for u in self.controls}
-        for place in self._needed(self.results):
+        for place in self._find_needed(self.results):
             operation, operands = self.instructions[place]
             if depends.isdisjoint(operands):
                 continue
@@ -189,17 +191,17 @@ class Formulas:
             moved.append(place)
         return moved, factors, True
 
-    def _computed(self, values: Mapping[str, Number], places: Iterable[int], like: Tensor) -> dict[int, Number]:
-        """The numbers at some places, and at those on which they depend."""
+    def _compute(self, values: Mapping[str, Number], places: Iterable[int], like: Tensor) -> dict[int, Number]:
+        """Place ↦ value for some places, and for those on which they depend."""
         given = {k: values[name] for k, name in enumerate(self.names) if name in values}
         found: dict[int, Number] = {**self.constants, **given}
-        for place in self._needed(places):
+        for place in self._find_needed(places):
             operation, operands = self.instructions[place]
-            found[place] = _computed(operation, [found[k] for k in operands], like)
+            found[place] = _compute(operation, [found[k] for k in operands], like)
         return found
 
-    def _needed(self, results: Iterable[int]) -> list[int]:
-        """The places of the instructions on which results depend, in the order of the text."""
+    def _find_needed(self, results: Iterable[int]) -> list[int]:
+        """The places of the instructions on which results depend, in the order of computation."""
         needed, waiting = set[int](), list(results)
         while waiting:
             place = waiting.pop()
@@ -238,7 +240,7 @@ class Formulas:
         self._places[name] = self._place_of(expression, place)
 
     def _place_of(self, node: ast.AST, where: str) -> int:
-        """The place of an expression's result, with the instructions that it takes."""
+        """The place of an expression's result; adds the instructions for it."""
         match node:
             case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
                 return self._constant(float(value))
@@ -329,8 +331,8 @@ def _assignment(line: str, place: str) -> tuple[str, ast.AST]:
         ) from error
 
 
-def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Number:
-    """The result of an operation: a float if all operands are."""
+def _compute(operation: str, operands: Sequence[Number], like: Tensor) -> Number:
+    """The result of an operation: a float if all operands are floats."""
     if not any(isinstance(each, Tensor) for each in operands):
         with np.errstate(all="ignore"):
             return float(_OPERATIONS[operation].of_numbers(*map(np.float64, operands)))
@@ -351,7 +353,7 @@ def _computed(operation: str, operands: Sequence[Number], like: Tensor) -> Numbe
 
 
 def _factors(operation: str, depends: Sequence[bool]) -> list[int] | None:
-    """Which operands scale or choose the slopes of a result, if some operands depend on u; None if it is not affine."""
+    """Indices of operands that are factors of the result's slopes, or conditions; None if it is not affine in u."""
     match operation, *depends:
         case ("+" | "-" | "negative", *_):
             return []
@@ -369,7 +371,7 @@ def _factors(operation: str, depends: Sequence[bool]) -> list[int] | None:
 def _slopes(
     operation: str, slopes: Sequence[Mapping[int, Number]], numbers: Sequence[Number], like: Tensor
 ) -> dict[int, Number]:
-    """The slopes by control of a result, from those of its operands, and the numbers that scale or choose them."""
+    """Control ↦ slope of a result, from the slopes of its operands and from their values (factors and conditions)."""
     columns = {j: None for each in slopes for j in each}
 
     def of(k: int, j: int) -> Number:
@@ -377,22 +379,22 @@ def _slopes(
 
     match operation:
         case "negative":
-            return {j: _computed("negative", [of(0, j)], like) for j in columns}
+            return {j: _compute("negative", [of(0, j)], like) for j in columns}
         case "+" | "-":
             first = dict(slopes[0])
-            return first | {j: _computed(operation, [of(0, j), of(1, j)], like) for j in slopes[1]}
+            return first | {j: _compute(operation, [of(0, j), of(1, j)], like) for j in slopes[1]}
         case "where":
-            return {j: _computed("where", [numbers[0], of(1, j), of(2, j)], like) for j in columns}
+            return {j: _compute("where", [numbers[0], of(1, j), of(2, j)], like) for j in columns}
         case _:
             k = 0 if slopes[0] else 1
-            return {j: _computed(operation, [slope, numbers[1 - k]], like) for j, slope in slopes[k].items()}
+            return {j: _compute(operation, [slope, numbers[1 - k]], like) for j, slope in slopes[k].items()}
 
 
 def _tensor(value: Number, like: Tensor) -> Tensor:
     return value if isinstance(value, Tensor) else torch.full_like(like, value)
 
 
-def _filled(value: Number, like: Tensor) -> Tensor:
+def _fill(value: Number, like: Tensor) -> Tensor:
     """A number as a tensor of the whole batch."""
     value = _as_number(value, like)
     return value.expand_as(like) if isinstance(value, Tensor) else torch.full_like(like, value)

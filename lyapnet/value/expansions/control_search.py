@@ -1,4 +1,4 @@
-"""The minimum over controls of a function that need not be convex, as the Hamiltonian of many systems."""
+"""The minimum over controls of a function that need not be convex, such as the Hamiltonian of many systems."""
 
 from collections.abc import Callable
 
@@ -13,24 +13,24 @@ from lyapnet.value.derivatives import jacobian
 
 Several = Float[Tensor, "k *batch m"]  # several controls for each state
 Objective = Callable[[Control], PerState]  # Q of controls (*several, *batch, m), smooth, per second
-PLACES = 16  # of each control, at which Q is compared
-GROUPS = 4  # of neighbouring places, the lowest of each of which is a start
-FIRST_STEPS = 2  # Newton steps from each start
-LAST_STEPS = 5  # from the lowest of the points found
-SHARES = (3.0, 1.0, 0.3, 0.03)  # step sizes of the line search in each of them; the longest leaves a hill sooner
-POLISHING_STEPS = 1  # Newton steps without one, which rounding of Q would stop
+PLACES = 16  # number of values of each control at which Q is compared
+GROUPS = 4  # number of groups of neighbouring values; the best of each is a start
+FIRST_STEPS = 2  # number of Newton steps from each start
+LAST_STEPS = 5  # number of Newton steps from the best point after these
+SHARES = (3.0, 1.0, 0.3, 0.03)  # step sizes of the line search in a Newton step; the largest is for negative curvature
+POLISHING_STEPS = 1  # number of last Newton steps without a line search, which the rounding of Q would end too early
 
 
 def minimise_over_controls(problem: Problem, Q: Objective, starts: Several, weight: ControlMatrix) -> Control:
-    """argmin over u ∈ U of Q(u) + s(u), (*batch, m), the lowest of the local minima found from several starts.
+    """argmin over u ∈ U of Q(u) + s(u), (*batch, m), the best of the local minima found from several starts.
 
-    Newton steps, each the minimiser over U of the quadratic model of Q with s, and a line search. A curvature that is
-    not convex is replaced by |Q_uu| with its rows summed up on the diagonal, plus the weight. The derivative is that of
-    the minimiser (implicit function theorem).
+    A Newton step leads towards the minimiser over U of the quadratic model of Q plus s, with a line search. An
+    indefinite Q_uu is made positive definite by adding twice its absolute row sums to the diagonal, and the weight. The
+    derivative is that of the minimiser (implicit function theorem).
 
     Args:
         problem: U, a box or all of ℝᵐ, and s.
-        Q: the objective without s, (k, *batch, m) ↦ (k, *batch) for any k, also without it.
+        Q: the objective without s, (k, *batch, m) ↦ (k, *batch) for any k, and (*batch, m) ↦ (*batch).
         starts: (k, *batch, m) in U.
         weight: (*batch, m, m), symmetric positive definite, as 2R: the least curvature is CONVEX times it.
 
@@ -55,8 +55,9 @@ def minimise_over_controls(problem: Problem, Q: Objective, starts: Several, weig
 def starts_of(problem: Problem, Q: Objective, nominal: Control, paid: PerState, weight: ControlMatrix) -> Several:
     """Starts of a search (k, *batch, m): the nominal control, one Newton step from it, and GROUPS for each control.
 
-    These are the lowest of PLACES between its limits, the others at their nominal values. Without a limit the places
-    are within a reach on both sides: that of the Newton step, plus the size that costs as much as the state does.
+    For these, PLACES values between the limits of one control are compared, with the others at their nominal values.
+    Without a limit the values are up to the length of the Newton step, plus the size that costs ℓ, from the nominal
+    one.
 
     Args:
         paid: ℓ at the nominal control, per second.
@@ -107,20 +108,20 @@ class _Search:
         return best
 
     def total(self, u: Control) -> PerState:
-        """Q + s, infinite where it is not a number."""
+        """Q + s; infinite where it is not finite."""
         total = self.Q(u) + self.problem.cost.beside(u)
         return torch.where(total.isfinite(), total, torch.inf)
 
     def newton(self, u: Control) -> Control:
-        """The minimiser over U of the quadratic model of Q around u, and s; the curvature is not differentiated."""
+        """The minimiser over U of s plus the quadratic model of Q around u, whose Q_uu counts as a constant."""
         slope, curvature = derivatives_of(self.Q, u)
         W = self._convex(curvature, u.detach(), slope.detach())
         return self.problem.best_control(W / 2, slope - apply(W, u.detach()))
 
     def _convex(self, curvature: Tensor, u: Control, slope: Control) -> Tensor:
-        """Q_uu, or a positive definite matrix if it is not convex.
+        """Q_uu, or a positive definite matrix if it is indefinite.
 
-        A control that its slope holds at a limit does not move; only the curvature of the others has to be convex.
+        A control whose slope holds it at a limit does not move; only Q_uu of the others has to be positive definite.
         """
         falling = torch.where(slope > 0, u - 1, u + 1)
         moves = (self.problem.controls.project(falling) != u).to(u)
@@ -132,7 +133,7 @@ class _Search:
 
 
 def derivatives_of(Q: Objective, u: Control) -> tuple[Control, ControlMatrix]:
-    """(Q_u, Q_uu) at u; Q_u is part of the graph of what else Q depends on, where one is recorded."""
+    """(Q_u, Q_uu) at u; autograd can differentiate Q_u by the other tensors that Q depends on."""
     recording = torch.is_grad_enabled()
     with torch.enable_grad():
         u = u.detach().requires_grad_()

@@ -1,4 +1,4 @@
-"""The gains of one node in the backward pass: how the best control moves with the state, and what it costs."""
+"""The gains of one node in the backward pass: the derivative of the best control by the state, and its cost."""
 
 import torch
 from torch import Tensor
@@ -8,14 +8,14 @@ from lyapnet.base.types import Control, PerState
 from lyapnet.task.cost.control_costs import local_shape
 from lyapnet.task.problem import Problem
 
-ROUNDING = 1e-12  # eigenvalues of Q_uu below this share of the largest are only rounding errors
+ROUNDING = 1e-12  # eigenvalue of Q_uu, relative to the largest, below which it may be only a rounding error
 
 
 def gain_of_node(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
     """(k, K) from Q_ua = (Q_u, Q_ux): k = argmin of ½ kᵀQ_uu k + Q_uᵀk + Δt s(u + k) over u + k ∈ U, K its derivative.
 
     With P the projection onto the directions in which the minimiser moves, and S the curvature of s there,
-    K = −P (P(Q_uu + Δt S)P + 1 − P)⁻¹ P Q_ux: none for controls at a limit, or at a kink of s.
+    K = −P (P(Q_uu + Δt S)P + 1 − P)⁻¹ P Q_ux. Its rows are zero for controls at a limit, or at a kink of s.
 
     Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
     """
@@ -31,7 +31,7 @@ def gain_of_node(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Te
 
 
 def cost_beside(problem: Problem, u: Control, gain: Tensor, left: Tensor) -> Tensor:
-    """What s(u) and a curved border of U add to W = [[2c, pᵀ], [p, H]] of a node: Δt s(u + k) in c, and in p and H.
+    """The parts of W = [[2c, pᵀ], [p, H]] of a node by s(u) and by a curved border of U.
 
     At the minimum k the slope of Δt s along K is −(Q_u + Q_uu k), and its curvature along K is −(Q_ux + Q_uu K).
 

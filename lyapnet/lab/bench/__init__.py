@@ -1,4 +1,4 @@
-"""What each route to the gradient costs, and what it gets wrong: seconds, memory and error side by side."""
+"""Benchmarks: time, memory and error of the ways to compute gradients, of enclosures and of controls."""
 
 from lyapnet.lab.bench.accuracy import Accuracy, gradient_accuracy
 from lyapnet.lab.bench.cases import Case, is_chain, load_case

@@ -14,8 +14,8 @@ from lyapnet.loop.programs import ValueProgram
 from lyapnet.loop.rollout import ADAPTIVE_METHODS
 from lyapnet.task.horizon import TABLEAUX
 
-SLICE = 256  # states whose graph the reference holds at once
-READ_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # what a loss may read ↦ its axis of states
+SLICE = 256  # number of states whose graph the reference stores at once
+READ_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # tensor that a loss may use ↦ axis of states
 
 
 def reference_gradient(case: Case, x0: State) -> Tensor:
@@ -45,7 +45,7 @@ def relative_error(gradient: Tensor, reference: Tensor) -> float:
 
 
 class Accuracy(NamedTuple):
-    """The error of one gradient, and what it took."""
+    """The error of one gradient, and its work."""
 
     route: str
     method: str

@@ -1,4 +1,4 @@
-"""What is differentiated: a task, a V of fresh weights, and the loss of a program."""
+"""The function to differentiate: the loss of a program for a task and a V with random weights."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ class Case(NamedTuple):
     program: Program
 
     def rollout(self, gradient: str, V: ValueFunction | None = None, **options: Any) -> Rollout:
-        """The closed loop with that rollout.gradient, costates of any length, and further options of its section."""
+        """The closed loop with a given rollout.gradient and other options of this section, and costates of any size."""
         section = replace(self.config.rollout, gradient=gradient, costate_limit=None, **options)
         return build_rollout(replace(self.config, rollout=section), self.problem, self.V if V is None else V)
 
@@ -44,7 +44,7 @@ class Case(NamedTuple):
         return self.problem.initial_states.sample(batch, stream(self.config.seed, TEST))
 
     def in_steps(self, steps: int) -> "Case":
-        """The same T in another number of steps."""
+        """The case with the same T and another number of steps."""
         return self._replace(problem=self.problem.in_steps(steps=steps, dt=self.problem.horizon.duration / steps))
 
 

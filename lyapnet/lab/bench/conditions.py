@@ -1,4 +1,4 @@
-"""What is bounded: decrease conditions of known truth, and of a network like those that are trained."""
+"""The functions to bound: decrease conditions with known truth, and that of a network like trained ones."""
 
 import copy
 from typing import NamedTuple
@@ -36,7 +36,7 @@ class Bounded(NamedTuple):
 
 
 class Quadratic(ValueFunction):
-    """V(t, x) = xᵀPx, with a network's N(t, x) on top if there is one."""
+    """V(t, x) = xᵀPx, plus N(t, x) if a network is given."""
 
     P: Float[Tensor, "n n"]
 
@@ -51,15 +51,15 @@ class Quadratic(ValueFunction):
 
 
 def stationary(system: Linear, cost: QuadraticCost) -> Tensor:
-    """P of the infinite horizon: the Riccati solution 40 s before its end, (n, n)."""
+    """P of the infinite horizon, (n, n), approximated by the Riccati solution 40 s before the end of a horizon."""
     return continuous_riccati(system, cost, Horizon(200, 0.2)).P[0]
 
 
 def condition_of_network(seed: int = 0) -> Bounded:
     """The condition on the double integrator with V = xᵀPx + N(t, x).
 
-    P is Riccati's, N a tanh network of 32 and 32, zero at the goal. As a trained V is: near the value function, so that
-    the terms of V̇ + αℓ all but cancel, and not quadratic.
+    P is the Riccati solution, N a tanh network with two layers of 32, zero at the goal. Like a trained V, this one is
+    close to the value function, so that the terms of V̇ + αℓ nearly cancel, and it is not quadratic.
     """
     system, cost = DoubleIntegrator().double(), _cost([10.0, 0.1])
     with torch.random.fork_rng(devices=[]):
@@ -107,7 +107,7 @@ def condition_of_chain(n: int, delta: float = 0.5, holds: bool = True) -> Bounde
 
 
 def _breaking_factor(Q: Tensor, S: Tensor, slack: float) -> float:
-    """The s ∈ [½, 1] with max xᵀMx = 1.1 δ over the corners of the box; M falls with s there, in every direction."""
+    """The s ∈ [½, 1] with max xᵀMx = 1.1 δ over the corners of the box; on this interval M decreases in s."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * len(Q)).reshape(-1, len(Q))
 
     def largest(s: float) -> float:
@@ -125,7 +125,7 @@ def _breaking_factor(Q: Tensor, S: Tensor, slack: float) -> float:
 
 def _condition(system: Linear, cost: QuadraticCost, V: ValueFunction, delta: float) -> DecreaseCondition:
     box = Box([-1.0] * system.n, [1.0] * system.n)
-    problem = Problem(system, cost, Unbounded(), box, Horizon(1, 1.0)).double()  # a condition knows no horizon
+    problem = Problem(system, cost, Unbounded(), box, Horizon(1, 1.0)).double()  # conditions do not use the horizon
     closed_loop = ClosedLoop(problem, HJBPolicy(problem, V)).requires_grad_(False)
     return DecreaseCondition(closed_loop, ALPHA, delta)
 

@@ -1,4 +1,4 @@
-"""Enclosures of one traced function on boxes: the certifier's forms, and what they are held against."""
+"""Enclosures of a traced function on boxes: the certifier's, and others to compare them with."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,30 +19,30 @@ Enclosure = Callable[[Tensor, Tensor], Sides]
 
 
 def affine(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
-    """Forms of first degree: the excess is of second order in the box."""
+    """Forms of first degree; their excess is of second order in the sides of the box."""
     return lambda lower, upper: bounded.image(box_form(lower, upper))[0].interval()
 
 
 def quadratic(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
-    """Forms of second degree, as the certifier has them: what cancels in second order cancels in the bounds."""
+    """Forms of second degree, as in the certifier: terms up to second order that cancel also cancel in the bounds."""
     return lambda lower, upper: bounded.image(box_form(lower, upper, bounded.degree))[0].interval()
 
 
 def compiled(bounded: BoundedFunction, sample: Sides) -> Enclosure | None:
-    """The same by machine code, as the certifier has them in a long search; None where there is none."""
+    """The same by machine code, as in the certifier's long searches; None if there is none."""
     kernel = bounded.kernel(*(side[None] for side in sample))
     return None if kernel is None else lambda lower, upper: kernel.forms(lower, upper)[0].interval()
 
 
 def interval(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
-    """Plain interval arithmetic: exact images of single operations; the excess of the whole is of first order."""
+    """Interval arithmetic: exact ranges of single operations; the excess of their composition is of first order."""
     return lambda lower, upper: bounded.image(interval_form(lower, upper))[0].interval()
 
 
 def mean_value(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
-    """c(m) + Σ_k [∂c/∂y_k] (y_k − m_k), m the middle of the box, its gradient on the box by interval arithmetic.
+    """c(m) + Σ_k [∂c/∂y_k] (y_k − m_k), m the middle of the box, with the gradient on the box by interval arithmetic.
 
-    It is of second order, with the interval excess of the gradient as its factor.
+    Its excess is of second order, proportional to that of the gradient.
     """
     slopes = BoundedFunction(lambda t, x: gradients(c, t, x), sample)
 
@@ -79,8 +79,7 @@ def enclosure(name: str, c: Value, sample: Sides) -> Enclosure:
 
 
 def enclosures_of(c: Value, sample: Sides, say: Callable[[str], Any]) -> dict[str, Enclosure]:
-    """All enclosures of c, which is traced once; those of its gradient are left out where that has no bounds, and
-    machine code where there is none.
+    """All enclosures of c, which is traced once, as far as its gradient has bounds and machine code is available.
 
     Args:
         say: called with the reason why one is left out: training never needs the gradient of c.

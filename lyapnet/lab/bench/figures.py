@@ -28,7 +28,7 @@ METHOD_LINES = {"euler": "-", "midpoint": ":", "rk4": "--", "dopri5": "-."}
 
 
 def certify_bench(bounds: Sequence[Tightness], proofs: Sequence[Attempt]) -> Figure:
-    """Left: how many times too wide each enclosure is, by side. Right: seconds to a verdict, by dimension."""
+    """Left: width of each enclosure relative to the range, by side. Right: seconds to a verdict, by dimension."""
     figure = Figure(figsize=(9, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_tightness(left, bounds)
@@ -54,7 +54,7 @@ def _draw_tightness(axes: Axes, rows: Sequence[Tightness]) -> None:
 
 
 def _draw_proofs(axes: Axes, rows: Sequence[Attempt]) -> None:
-    """Lines join proofs; an open marker is a budget spent without a verdict."""
+    """Lines join proofs; an open marker is a spent budget without a verdict."""
     for method in dict.fromkeys(row.method for row in rows):
         color, marker, line = ENCLOSURE_STYLES[method]
         tried = [row for row in rows if row.method == method and row.holds]
@@ -76,7 +76,7 @@ def _draw_proofs(axes: Axes, rows: Sequence[Attempt]) -> None:
 
 
 def gradient_time(rows: Sequence[BenchRow]) -> Figure:
-    """Seconds for a loss and its gradient, and environment steps per second, against the batch; a column for a task."""
+    """Seconds for a loss and its gradient, and environment steps per second, by batch; a column for each task."""
     tasks = list(dict.fromkeys(row.task for row in rows))
     figure = Figure(figsize=(max(3.4 * len(tasks), 5.6), 6.4), layout="constrained")
     grid = figure.subplots(2, len(tasks), sharex="col", sharey="row", squeeze=False)
@@ -93,7 +93,7 @@ def gradient_time(rows: Sequence[BenchRow]) -> Figure:
 
 
 def steps_per_second_against_n(rows: Sequence[BenchRow]) -> Figure:
-    """Environment steps per second against the number of states; a panel for a batch."""
+    """Environment steps per second, by number of states; a panel for each batch."""
     batches = sorted({row.batch for row in rows})
     figure = Figure(figsize=(max(3.4 * len(batches), 5.6), 3.9), layout="constrained")
     panels = figure.subplots(1, len(batches), sharey=True, squeeze=False)[0]
@@ -107,7 +107,7 @@ def steps_per_second_against_n(rows: Sequence[BenchRow]) -> Figure:
 
 
 def gradient_error(points: Sequence[Accuracy], title: str) -> Figure:
-    """Each route's gradient error against what it took: from the loss that is trained, and from continuous time."""
+    """Error of each route's gradient by its work: relative to that of the same steps, and to continuous time."""
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     fields = {
@@ -134,7 +134,7 @@ def gradient_error(points: Sequence[Accuracy], title: str) -> Figure:
 
 
 def _draw_routes(axes: Axes, rows: Sequence[BenchRow], x: str, y: str) -> None:
-    """A line for each route; whole where it is compiled, dashed where it is not."""
+    """A line for each route; solid if it is compiled, else dashed."""
     for route, compiled in dict.fromkeys((row.route, row.compiled) for row in rows):
         chosen = sorted((getattr(r, x), getattr(r, y)) for r in rows if (r.route, r.compiled) == (route, compiled))
         color, marker = ROUTE_STYLES[route]

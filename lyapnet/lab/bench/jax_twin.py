@@ -1,4 +1,4 @@
-"""A peer in JAX, for the benchmark: lyapnet's loss and gradient as one would write them there in a hurry.
+"""An implementation in JAX to compare with: lyapnet's loss and gradient in the simplest form.
 
 Everything is written for one state and vmapped: V_x is `jax.grad` of V, the closed loop one `lax.scan`, the gradient
 `jax.value_and_grad` of the loss, and the whole jitted. It covers the HJB policy under Euler with the exact gradient of

@@ -1,4 +1,4 @@
-"""How long one control takes, in a loop of 1 kHz: in C as it is exported, and in Python."""
+"""Time for one control in a loop of 1 kHz: in exported C, and in Python."""
 
 import subprocess
 import tempfile
@@ -20,9 +20,9 @@ from lyapnet.exchange.export.verification import points
 from lyapnet.graphs.c_text import literal
 
 RATE = 1000  # controls per second
-STATES = 1000  # that are asked for in turn
-LOOPS = 64  # closed loops along which others are asked
-NATIVE = "-O3 -march=native"  # which not every compiler knows
+STATES = 1000  # number of states whose controls are computed in turn
+LOOPS = 64  # number of closed loops from which these states are taken
+NATIVE = "-O3 -march=native"  # options that not every compiler supports
 OPTIMISED = {"C, -O2": "-O2", "C, -O3": "-O3", f"C, {NATIVE}": NATIVE, "  core kept awake": f"{NATIVE} -DAWAKE"}
 LOOP = """#define _POSIX_C_SOURCE 200112L
 #include <stdio.h>
@@ -61,7 +61,7 @@ Policy = Callable[[float, NDArray], NDArray]  # t, x (n,) ↦ u (m,)
 
 @dataclass(frozen=True)
 class Latency:
-    """One way to ask for u, and the microseconds that it took."""
+    """The time for one control in one way, in microseconds."""
 
     way: str
     calls: int
@@ -71,7 +71,7 @@ class Latency:
 
 
 def latencies(controller: Controller, seconds: float, others: Mapping[str, Policy] | None = None) -> list[Latency]:
-    """How long u takes, each way for so many seconds: in C, compiled in Python, and `Controller.policy`.
+    """The time for u in C, compiled in Python, and by `Controller.policy`, each measured for some seconds.
 
     Between two calls the process sleeps, so that caches and the core are cold at each; "core kept awake" waits by
     looking at the clock, as a loop on a core of its own would. Where the compiler has no -march=native, two rows less.
@@ -116,7 +116,7 @@ def _along_loops(controller: Controller) -> tuple[NDArray, NDArray]:
 
 
 def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
-    """The text of a program that prints the microseconds of each call."""
+    """The text of a C program that prints the microseconds of each call."""
     table = np.concatenate([t[:, None], x], 1)
     rows = ",\n    ".join("{" + ", ".join(map(literal, row)) + "}" for row in table.tolist())
     constants = len(controller.system.constants)
@@ -134,7 +134,7 @@ def _in_c(folder: Path, options: str) -> NDArray:
 
 
 def _in_python(policy: Policy, t: NDArray, x: NDArray, count: int) -> NDArray:
-    """As many calls as fit into the time, at most that number."""
+    """As many calls as fit into the time, up to a largest number."""
     taken, following = list[float](), time.perf_counter()
     end = following + count / RATE
     while len(taken) < count and following < end:

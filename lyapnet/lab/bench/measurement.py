@@ -20,7 +20,7 @@ from lyapnet.lab.bench.routes import JAX_ROUTES, entries, timed
 
 @dataclass(frozen=True)
 class BenchRow:
-    """One route on one task and batch, as `lyapnet bench --json` prints it."""
+    """One route on one task and batch, a row of `lyapnet bench --json`."""
 
     task: str
     states: int  # n
@@ -38,14 +38,14 @@ class BenchRow:
 def time_routes(
     case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]
 ) -> list[BenchRow]:
-    """A row for each route, and for each compiled one: all warmed up, then timed in turns, `repeats` times each.
+    """A row for each route as written and compiled; after a first call they are timed in turns, `repeats` times each.
 
     Args:
         case, batch, routes, repeats: what is measured.
-        say: called with the reason where compiled rows are left out.
+        say: called with the reason if compiled rows are left out.
 
     Raises:
-        DivergenceError: the closed loop of the fresh V leaves the finite numbers.
+        DivergenceError: the closed loop of the random V is not finite.
     """
     x0 = case.sample(batch)
     ready = list(entries(case, x0, routes, say))
@@ -73,16 +73,16 @@ def _errors(gradients: Sequence[Tensor | None], case: Case, x0: State) -> list[f
 
 
 def use_threads(threads: int) -> None:
-    """Compute on that many CPU threads; so does JAX, unless it has computed before."""
+    """Set the number of CPU threads of torch, and of JAX if it has not computed yet."""
     base_threads.use_threads(threads)
     os.environ["NPROC"] = str(threads)
 
 
 def peak_bytes(run: Callable[[], Any]) -> int:
-    """The most that a call holds of torch's CPU memory, beyond what was held before, in bytes.
+    """The largest increase of torch's CPU memory during a call, in bytes.
 
-    The allocator itself reports to torch's profiler, whether eager code, autograd or compiled code asks for memory.
-    Scratch that kernels take from elsewhere, as MKL does, is not seen.
+    torch's profiler records all requests to torch's allocator, by eager code, autograd and compiled code. It does not
+    see memory that kernels such as MKL allocate themselves.
     """
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or the profiler writes to the terminal
     gc.collect()

@@ -17,7 +17,7 @@ METHODS = (CERTIFIER, *ENCLOSURES)
 
 @dataclass(frozen=True)
 class Attempt:
-    """One proof or refutation, as `lyapnet bench certify --json` prints it."""
+    """One proof or refutation, a row of `lyapnet bench certify --json`."""
 
     case: str
     states: int  # n
@@ -25,11 +25,11 @@ class Attempt:
     method: str
     verdict: str
     boxes: int
-    seconds: float  # with those for tracing c, which its gradient takes longer to
+    seconds: float  # includes tracing c, and its gradient if the method needs it
 
 
 def growth(dimensions: Sequence[int], seconds: float, delta: float = 0.5) -> Iterator[Attempt]:
-    """The chains of integrators, c ≤ 0 and its twin that fails, by each method; what stayed unknown goes no further."""
+    """Rows for chains of integrators: c ≤ 0 that holds, for each method up to its first unknown; and one that fails."""
     lost: set[str] = set()
     for n in sorted(dimensions):
         for method in METHODS:
@@ -41,7 +41,7 @@ def growth(dimensions: Sequence[int], seconds: float, delta: float = 0.5) -> Ite
 
 
 def attempt(case: Bounded, method: str, seconds: float, holds: bool = True) -> Attempt:
-    """A method on a condition.
+    """The row of a method for a condition.
 
     Raises:
         UsageError: there is no such method.
@@ -56,9 +56,9 @@ def attempt(case: Bounded, method: str, seconds: float, holds: bool = True) -> A
 
 
 def bisect(case: Bounded, enclose: Enclosure, budget: Budget) -> tuple[str, int]:
-    """(verdict on c ≤ 0, boxes): a box is dropped where c ≤ 0 on it, else cut across its widest axis, deepest first.
+    """(verdict on c ≤ 0, boxes) by bisection across the widest axis, depth first, of boxes on which c ≤ 0 is open.
 
-    Nothing of what the certifier adds: no search beyond the middles of boxes, no choice of axis by remainder.
+    It lacks the certifier's search for counterexamples off the middles of boxes, and its choice of the axis.
     """
     sides = torch.where(case.upper > case.lower, case.upper - case.lower, 1.0)
     frontier = root_box(case.lower, case.upper, 0.0)

@@ -1,4 +1,4 @@
-"""The routes that are compared, each ready to run."""
+"""The routes to compare: ways to compute the gradient, each as a function to call."""
 
 import importlib.util
 import time
@@ -29,12 +29,12 @@ class Entry(NamedTuple):
     route: str
     compiled: bool
     run: Callable[[], Any]
-    flat: Callable[[Any], Tensor] | None  # what run returns ↦ its gradient, one float64 vector; None: no gradient
+    flat: Callable[[Any], Tensor] | None  # result of run ↦ its gradient, one float64 vector; None: no gradient
     compile_seconds: float | None = None
 
 
 class WithoutFormula(ValueFunction):
-    """V without its formula for V_x, which leaves V_x to autograd."""
+    """V without its formula for V_x, so that autograd computes V_x."""
 
     def __init__(self, V: ValueFunction):
         super().__init__()
@@ -45,7 +45,7 @@ class WithoutFormula(ValueFunction):
 
 
 def routes_for(case: Case, asked: Sequence[str] = ()) -> list[str]:
-    """The routes that were asked for, or else all that this task and this machine offer.
+    """The given routes; without any, all that this task and this machine support.
 
     Raises:
         UsageError: a route that is unknown, or that cannot be taken here.
@@ -59,10 +59,10 @@ def routes_for(case: Case, asked: Sequence[str] = ()) -> list[str]:
 
 
 def entries(case: Case, x0: State, routes: Sequence[str], say: Callable[[str], Any]) -> Iterator[Entry]:
-    """Each route as written, and then compiled where it can be.
+    """Each route as written, and then compiled if possible.
 
     Args:
-        say: called with the reason where it cannot.
+        say: called with the reason if it is not.
     """
     adaptive = case.config.rollout.method in ADAPTIVE_METHODS
     gradient_of = {**GRADIENT_OF, FLOOR: REFERENCE} if adaptive else GRADIENT_OF
@@ -87,7 +87,7 @@ def entries(case: Case, x0: State, routes: Sequence[str], say: Callable[[str], A
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call returns, and its seconds."""
+    """(result, seconds) of a call."""
     started = time.perf_counter()
     result = run()
     return result, time.perf_counter() - started
@@ -125,7 +125,7 @@ def _jax_twin(case: Case, route: str) -> Any:
 
 
 def _obstacle(case: Case, route: str) -> str | None:
-    """Why a route cannot be taken."""
+    """The reason why a route is not possible here; None if it is."""
     method, policy = case.config.rollout.method, case.config.rollout.policy
     if route == EXACT and method in ADAPTIVE_METHODS:
         return f"the steps of {method} depend on the state; change rollout.method."

@@ -1,4 +1,4 @@
-"""What lyapnet bench shows in the terminal."""
+"""The tables of lyapnet bench for the terminal."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from lyapnet.lab.bench.tightness import Tightness
 
 
 def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
-    """What each route to one task's gradient costs, and what it gets wrong."""
+    """Time, memory and error of each route for one task."""
     parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.problem.horizon
     columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
     table = Table("route", "com-\npiled", *columns)
@@ -35,7 +35,7 @@ def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table
 
 
 def tightness_table(rows: Sequence[Tightness], boxes: int) -> Table:
-    """How many times wider than the range each enclosure is."""
+    """The width of each enclosure relative to the range."""
     columns = [Column(f"{side:g}", justify="right") for side in rows[0].sides]
     table = Table("enclosure", *columns, Column("order", justify="right"), Column("boxes\nper s", justify="right"))
     table.title = f"{rows[0].case}\nwidth of the enclosure / width of the range, by side of the box"
@@ -47,7 +47,7 @@ def tightness_table(rows: Sequence[Tightness], boxes: int) -> Table:
 
 
 def proofs_table(rows: Sequence[Attempt], seconds: float) -> Table:
-    """What each method says of c ≤ 0, and after how much work."""
+    """The verdict of each method on c ≤ 0, and its work."""
     columns = [Column(name, justify="right") for name in ("boxes", "seconds")]
     table = Table("n", "c ≤ 0", "method", "verdict", *columns)
     table.title = f"Riccati V on chains of n integrators, {seconds:g} s for each proof"
@@ -60,7 +60,7 @@ def proofs_table(rows: Sequence[Attempt], seconds: float) -> Table:
 
 
 def latency_table(rows: Sequence[Latency], title: str) -> Table:
-    """Microseconds of one control, each way."""
+    """Microseconds of one control in each way."""
     table = Table("", *(Column(name, justify="right") for name in ("calls", "median", "99.9 %", "worst")))
     table.title = f"{title}\nmicroseconds of u(t, x), 1 kHz"
     for row in rows:

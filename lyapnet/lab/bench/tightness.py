@@ -1,4 +1,4 @@
-"""How much wider than the range an enclosure is, how fast that falls with the box, and boxes per second."""
+"""The width of enclosures relative to the range, its order of convergence, and boxes per second."""
 
 import math
 import statistics
@@ -15,14 +15,14 @@ from lyapnet.lab.bench.enclosures import Enclosure, Sides
 from lyapnet.lab.bench.routes import timed
 
 SIDES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
-SMALLEST = 3  # sides over which an order is measured
-AT_ONCE = 512  # boxes that are timed, as many as the certifier bounds in one call
-SAMPLES, STEPS = 256, 20  # with which a range is sought
+SMALLEST = 3  # number of sides, the smallest, from which an order is computed
+AT_ONCE = 512  # number of boxes in a timed call, as in the certifier
+SAMPLES, STEPS = 256, 20  # numbers of random points and of ascent steps in the search for a range
 
 
 @dataclass(frozen=True)
 class Tightness:
-    """One enclosure of one condition, as `lyapnet bench certify --json` prints it."""
+    """One enclosure of one condition, a row of `lyapnet bench certify --json`."""
 
     case: str
     enclosure: str
@@ -40,7 +40,7 @@ def tightness(
     repeats: int = 7,
     sides: Sequence[float] = SIDES,
 ) -> list[Tightness]:
-    """Each enclosure on the same random boxes within the case's; timed in turns."""
+    """A row for each enclosure, on the same random boxes within that of the case, timed in turns."""
     per_side = [random_boxes(case, side, boxes) for side in sides]
     ranges = [range_widths(case.condition, *pair) for pair in per_side]
     many = random_boxes(case, min(sides), AT_ONCE)
@@ -64,7 +64,7 @@ def order(sides: Sequence[float], excesses: Sequence[float]) -> float:
 
 
 def random_boxes(case: Bounded, side: float, boxes: int) -> Sides:
-    """Boxes that are that share of the case's along each axis, anywhere inside, the same at each call."""
+    """Random boxes within that of the case, with `side` times its sides, the same at each call."""
     generator = torch.Generator().manual_seed(0)
     unit = torch.rand(boxes, len(case.lower), generator=generator, dtype=torch.float64)
     widths = case.upper - case.lower
@@ -73,7 +73,7 @@ def random_boxes(case: Bounded, side: float, boxes: int) -> Sides:
 
 
 def range_widths(c: Value, lower: Tensor, upper: Tensor) -> Tensor:
-    """max c − min c over each box, (boxes,), from below: of corners and samples, and by ascent from the best."""
+    """A lower bound of max c − min c over each box, (boxes,): from corners, samples, and ascent from the best."""
     d = lower.shape[-1]
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * d).reshape(-1, d)
     generator = torch.Generator().manual_seed(1)
@@ -85,7 +85,7 @@ def range_widths(c: Value, lower: Tensor, upper: Tensor) -> Tensor:
 
 
 def _climbed(c: Value, lower: Tensor, upper: Tensor, points: Tensor, values: Tensor, sign: float) -> Tensor:
-    """max of sign · c over each box: from the 4 best points by steps along the signs of the gradient, ever shorter."""
+    """The max of sign · c found in each box, by shrinking steps along the gradient's signs from the 4 best points."""
     low, high, widths = lower[:, None], upper[:, None], (upper - lower)[:, None]
     best, at = values.topk(4, 1)
     points = points.gather(1, at[..., None].expand(-1, -1, points.shape[-1]))

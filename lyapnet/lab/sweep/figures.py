@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from lyapnet.base.drawing import CYCLE, GREY, legend_below
 from lyapnet.lab.sweep.runs import SweepRow
 
-SWEPT = {  # number of a row ↦ the label of its axis
+SWEPT = {  # name of a measure in a row ↦ label of its axis
     "cost_mean": "mean cost J",
     "cost_ratio": "cost / optimum",
     "value_error": "value error",
@@ -21,7 +21,7 @@ SWEPT = {  # number of a row ↦ the label of its axis
 
 
 def swept(rows: Sequence[SweepRow]) -> Figure:
-    """What runs reach and take against the key that was varied: a point for each seed, a line through the means."""
+    """Measures of runs against the varied key: a point for each seed, and a line through the means."""
     places = _places([row.value for row in rows])
     columns = {label: [_swept_number(row, name) for row in rows] for name, label in SWEPT.items()}
     known = {label: [number for number in column if number is not None] for label, column in columns.items()}
@@ -53,7 +53,7 @@ def swept(rows: Sequence[SweepRow]) -> Figure:
 
 
 def _places(values: Sequence[str | None]) -> dict[str | None, float]:
-    """Where each value of a key lies on its axis: where the number says, or one after the other."""
+    """The place of each value on the axis of a key: its number, or if it is none, its index."""
     try:
         return {value: float(value or "") for value in values}
     except ValueError:

@@ -1,4 +1,4 @@
-"""The points of a sweep: configs with a value of the key that is varied, each with its run and the command for it."""
+"""The points of a sweep: a config with a value of the varied key, its run, and the command for it."""
 
 import sys
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from lyapnet.training.runs import CONFIG, TrainingRun, runs_of
 
 @dataclass(frozen=True)
 class Point(Runnable):
-    """One run of a sweep: a config with a value of the key that is varied."""
+    """One run of a sweep: a config with a value of the varied key."""
 
     path: Path
     overrides: Sequence[str]
@@ -23,7 +23,7 @@ class Point(Runnable):
 
     @cached_property
     def settings(self) -> list[str]:
-        """All overrides; the experiment's name tells the value, so that its runs have a folder of their own."""
+        """All overrides; the experiment's name contains the value, so that each point has its own folder."""
         if self.key is None:
             return [*self.overrides]
         varied = [*self.overrides, f"{self.key}={self.value}"]
@@ -36,11 +36,11 @@ class Point(Runnable):
         return load_config(self.path, self.settings)
 
     def run(self) -> TrainingRun | None:
-        """The newest run of this very config from fresh weights, finished or not."""
+        """The newest run of exactly this config from fresh weights, finished or not."""
         config = self.config
         for run in reversed(runs_of(config)):
             written = run.folder / CONFIG
-            if not written.is_file() or run.finetuned_from:  # stopped before it wrote its config, or another start
+            if not written.is_file() or run.finetuned_from:  # it ended before it wrote its config, or was fine-tuned
                 continue
             if not [key for key in differing_keys(config, load_config(written)) if key != "logs"]:
                 return run
@@ -48,30 +48,30 @@ class Point(Runnable):
 
     @property
     def name(self) -> str:
-        """The experiment's."""
+        """The name of the experiment."""
         return self.config.experiment
 
     @property
     def folder(self) -> Path:
-        """Where its runs are."""
+        """The folder of its runs."""
         return Path(self.config.logs) / self.config.experiment
 
     @property
     def finished(self) -> bool:
-        """Whether it is trained to its end."""
+        """Whether its training is complete."""
         run = self.run()
         return run is not None and run.finished
 
     @property
     def command(self) -> list[str]:
-        """What trains it, from where a stopped run was."""
+        """The command that trains it, or resumes its run."""
         run = self.run()
         resume = [] if run is None or not run.last.is_file() else ["--resume", str(run.last)]
         return [sys.executable, "-m", "lyapnet", "train", "--config", str(self.path), *self.settings, *resume]
 
 
 def points_of(configs: Sequence[Path], vary: str | None, overrides: Sequence[str]) -> list[Point]:
-    """The runs that a sweep consists of.
+    """The points of a sweep.
 
     Raises:
         UsageError: `vary` is not key=value,value,…; one of the configs does not hold; or two of them share a folder.
@@ -83,7 +83,7 @@ def points_of(configs: Sequence[Path], vary: str | None, overrides: Sequence[str
         raise UsageError("Expected --config PATH at least once, got none; for example conf/double_integrator.yaml.")
     varied = [(key, value.strip()) for value in values.split(",")] if vary else [(None, None)]
     points = [Point(path, overrides, *one) for path in configs for one in varied]
-    experiments = [point.config.experiment for point in points]  # all are refused before any is trained
+    experiments = [point.config.experiment for point in points]  # loads, and thereby checks, all configs
     for experiment in experiments:
         if experiments.count(experiment) > 1:
             raise UsageError(f"Expected runs of different experiments, got {experiment} twice; leave one of them out.")

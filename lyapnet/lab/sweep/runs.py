@@ -1,4 +1,4 @@
-"""A sweep: each point trained in a process of its own, none twice, and what its runs reach, seed by seed."""
+"""A sweep: trains each point in its own process, none twice, and collects measures for each seed."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -17,18 +17,18 @@ MEASURES = (
     "cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "value_to_cost", "constraint_loss",
     "satisfied_fraction", "decreasing_fraction", "terminal_error",
 )  # fmt: skip
-NEAR = 0.02  # optimality gap
+NEAR = 0.02  # optimality gap that counts as near
 
 
 @dataclass(frozen=True)
 class SweepRow:
-    """One seed of one run, as the table of a sweep has it."""
+    """The measures of one seed of one run."""
 
     config: str  # the experiment's name without the value
     key: str | None
     value: str | None
     seed: int
-    measures: dict[str, float | None]  # MEASURES, as `lyapnet evaluate` has them
+    measures: dict[str, float | None]  # MEASURES, as in `lyapnet evaluate`
     seconds_to_near: float | None  # until the validation states cost within 2 % of the optimum; None: never, or unknown
     training_seconds: float  # all seeds of the run together
     peak_bytes: int  # the process of the run, all its seeds together
@@ -36,10 +36,10 @@ class SweepRow:
 
 
 def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any], ray: str | None = None) -> list[SweepRow]:
-    """Train what is not trained yet, `workers` at a time; a row for each seed of each run that came to its end.
+    """Train the points that are not trained yet, `workers` at a time; a row for each seed of each finished run.
 
     Args:
-        say: called with where each run is, or why it failed.
+        say: called with the folder of each run, or the reason of its failure.
         ray: the address of a Ray cluster that trains instead of this machine.
 
     Raises:
@@ -67,7 +67,7 @@ def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any], ray:
 
 
 def rows_of(point: Point, run: TrainingRun) -> Iterator[SweepRow]:
-    """A finished run's rows."""
+    """The rows of a finished run."""
     config, name = point.config, load_config(point.path, point.overrides).experiment
     result = json.loads(read_file(run.folder / EVALUATION))
     record = run.record()
@@ -83,7 +83,7 @@ def _seconds_to_near(folder: Path) -> float | None:
     from lyapnet.training.metrics_file import STEP, WALL_TIME, read_curves  # Lightning takes seconds to import
 
     gaps = read_curves(folder, "optimality_gap/val", WALL_TIME, STEP)
-    if not gaps or gaps[0][2] != 0:  # begun under version 0.1, which wrote no such file
+    if not gaps or gaps[0][2] != 0:  # started by version 0.1, which wrote no such file
         return None
     return next((round(seconds - gaps[0][1], 1) for gap, seconds, _ in gaps if gap <= NEAR), None)
 

@@ -1,4 +1,4 @@
-"""What a sweep shows in a terminal."""
+"""The table of a sweep for the terminal."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ SWEEP_COLUMNS = {
 
 
 def sweep_table(config: str, rows: Sequence[SweepRow]) -> Table:
-    """A line for each seed of a config's runs, and after several seeds their mean and their worst."""
+    """A line for each seed of a config's runs; for several seeds also their mean and worst."""
     key = rows[0].key
     names = [key.split(".")[-1]] if key else []
     headings = [*names, "seed", *SWEEP_COLUMNS.values(), "s to\n1.02", "min", "MB"]

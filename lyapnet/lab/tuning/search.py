@@ -1,4 +1,4 @@
-"""A search: trials that a study proposes, side by side; what it keeps on disk; and the config that is best."""
+"""A search for better settings: runs the trials of an Optuna study, and writes the best config."""
 
 import itertools
 import json
@@ -25,8 +25,8 @@ from lyapnet.lab.tuning.trials import BRIEF, Task, Training, Trial, command_of, 
 from lyapnet.training.build import build_module
 
 STUDY, BEST = "study.journal", "best.yaml"
-WITHOUT_PRUNING, WARM = 4, 3  # trials at first; one part in so many of a training, in which none is pruned
-STARTS = 8  # that trials share, at the most
+WITHOUT_PRUNING, WARM = 4, 3  # not pruned: this number of first trials, and the first 1/WARM of a training
+STARTS = 8  # largest number of starts that trials share
 ONE_STEP = ("training.iterations=1", "training.warmup=0", "training.learning_rate=1e-12")  # leaves the start as it is
 
 Say = Callable[[str], Any]
@@ -35,10 +35,10 @@ Say = Callable[[str], Any]
 def task_of(
     path: Path, overrides: Sequence[str], vary: Sequence[str], folder: Path | None, seed: int, say: Say
 ) -> Task:
-    """What is to be tuned, every value of which makes a config; all are refused before any is trained.
+    """The task of a search, after a check that configs with the extreme values of each key are valid.
 
     Raises:
-        UsageError: one does not, or a key cannot be varied.
+        UsageError: a config is not valid, or a key cannot be varied.
     """
     config = load_config(path, overrides)
     problem, compared = build_problem(config), config.evaluation.optimum
@@ -56,10 +56,10 @@ def task_of(
 
 
 def open_study(task: Task, say: Say) -> optuna.Study:
-    """The study in the folder of a search, which a killed one goes on with, or a new one.
+    """The study in the folder of a search, which is continued, or a new one.
 
     Raises:
-        UsageError: what is there was begun otherwise.
+        UsageError: the study there belongs to another task.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     task.folder.mkdir(parents=True, exist_ok=True)
@@ -89,10 +89,10 @@ def open_study(task: Task, say: Say) -> optuna.Study:
 
 
 def search(task: Task, study: optuna.Study, trials: int, workers: int, say: Say) -> None:
-    """Run trials until there are so many, `workers` at a time; a line for each that ends.
+    """Run trials until `trials` have ended, `workers` at a time; print a line for each.
 
     Raises:
-        LyapnetError: what trials start from cannot be made.
+        LyapnetError: a shared start cannot be made.
     """
     known = study.get_trials(deepcopy=False)
     running = [one for one in known if one.state == TrialState.RUNNING]
@@ -113,9 +113,9 @@ def search(task: Task, study: optuna.Study, trials: int, workers: int, say: Say)
 
 
 def shared_starts(task: Task, workers: int, say: Say) -> dict[tuple[str, ...], Path]:
-    """Settings that a start depends on ↦ a checkpoint with that start; none where they are many, or none is sought.
+    """Settings that a start depends on ↦ a checkpoint with this start; empty if there are more than STARTS.
 
-    Most of a short training is the search for its start, which no setting of the optimisation changes.
+    The start does not depend on the settings of the optimisation, and takes most of the time of a short training.
     """
     varied = [one for one in task.space if start_settings([f"{one.key}=0"])]
     choices = [[f"{one.key}={text}" for text in one.values] for one in varied if isinstance(one, Choice)]
@@ -132,7 +132,7 @@ def shared_starts(task: Task, workers: int, say: Say) -> dict[tuple[str, ...], P
 
 
 def verdict(trial: FrozenTrial, task: Task) -> str:
-    """How a trial ended, for readers."""
+    """The result of a trial in words."""
     if trial.state == TrialState.COMPLETE:
         return f"{task.measure} {trial.value:.4g}"
     if trial.state == TrialState.PRUNED:
@@ -141,13 +141,13 @@ def verdict(trial: FrozenTrial, task: Task) -> str:
 
 
 def best_of(study: optuna.Study) -> FrozenTrial | None:
-    """The complete trial of the least measure."""
+    """The complete trial with the least measure; None if there is none."""
     complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
     return min(complete, key=lambda trial: trial.value or 0.0, default=None)
 
 
 def write_best(task: Task, study: optuna.Study) -> Path | None:
-    """The best config so far as a YAML file, whose first line is the command that runs it; None before there is one."""
+    """Write the best config so far, with its command in the first line; return its path, None if there is none."""
     best = best_of(study)
     if best is None:
         return None
@@ -159,8 +159,8 @@ def write_best(task: Task, study: optuna.Study) -> Path | None:
 
 
 def _brief(task: Task, config: Config, settings: Sequence[str]) -> Any:
-    """What the YAML file of a config has to list: the given file's content with the changes; or all, where those would
-    mean something else in a file than on the command line."""
+    """The content of a YAML file for a config: that of the given file with the changes, if it means the same; else all
+    settings."""
     changes = [*task.overrides, *settings, f"experiment={config.experiment}"]
     layers = OmegaConf.create(read_yaml(task.path, Config)), OmegaConf.from_dotlist(changes)
     content: Any = OmegaConf.to_container(OmegaConf.merge(*layers))
@@ -168,7 +168,7 @@ def _brief(task: Task, config: Config, settings: Sequence[str]) -> Any:
 
 
 def train_anew(task: Task, best: FrozenTrial, say: Say) -> Training:
-    """The best settings trained from another seed, and evaluated on states that no trial saw.
+    """Train the best settings from another seed, and evaluate them on states that no trial used.
 
     Raises:
         LyapnetError: that training failed.
@@ -183,7 +183,7 @@ def train_anew(task: Task, best: FrozenTrial, say: Say) -> Training:
 
 
 def _train(trainings: Sequence[Training], workers: int, say: Say) -> None:
-    """Bring all to their end.
+    """Run trainings until all have ended.
 
     Raises:
         LyapnetError: one failed.

@@ -1,4 +1,4 @@
-"""What a search varies: keys of a config, each between two ends or among some values."""
+"""The search space: keys of a config, each with a range or a list of values."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,15 +15,15 @@ from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import Config, to_plain
 from lyapnet.value.networks.expansion import standard_widths
 
-TUNABLE = ("network", "pointwise", "program", "rollout", "trainer", "training")  # sections: the others are the task
-RATES, WEIGHTS = (3e-4, 3e-2), (1.0, 100.0)  # by default: ten times less and more than the standard recipe's
+TUNABLE = ("network", "pointwise", "program", "rollout", "trainer", "training")  # sections; others define the task
+RATES, WEIGHTS = (3e-4, 3e-2), (1.0, 100.0)  # default ranges: a tenth and ten times the standard recipe's values
 LOG = ":log"
 EXAMPLES = "training.learning_rate=1e-4..1e-2:log or training.batch_size=16,32,64"
 
 
 @dataclass(frozen=True)
 class Range:
-    """A key between two ends; whole numbers where both ends are."""
+    """A key with a range; integers if both ends are."""
 
     key: str
     low: float
@@ -41,16 +41,16 @@ class Range:
 
     @property
     def extremes(self) -> list[str]:
-        """The values that have to be valid for all to be."""
+        """The values to check; if they are valid, all are."""
         return [str(self.low), str(self.high)]
 
     def drawn(self, value: Any) -> Any:
-        """A given value as the distribution has it; None where that does not hold it."""
+        """A value of a config as a value of the distribution; None if it is outside."""
         inside = isinstance(value, int | float) and self.low <= value <= self.high
         return value if inside else None
 
     def text(self, value: float) -> str:
-        """A drawn value as the config has it, of three digits."""
+        """A value of the distribution as text for a config, with three digits."""
         if isinstance(value, int):
             return str(value)
         return str(min(max(float(f"{value:.3g}"), self.low), self.high))
@@ -58,7 +58,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Choice:
-    """A key among some values, each as the command line has it."""
+    """A key with a list of values, as on the command line."""
 
     key: str
     values: Sequence[str]
@@ -85,10 +85,10 @@ Dimension = Range | Choice
 
 
 def space_of(config: Config, vary: Sequence[str]) -> list[Dimension]:
-    """What is varied: the keys that are asked for, or those of the standard space.
+    """The space of the given keys; without any, the standard space.
 
     Raises:
-        UsageError: a key is none of a training's settings, or comes twice, or its values cannot be read.
+        UsageError: a key is not in TUNABLE, or given twice, or its values cannot be read.
     """
     space = [_dimension(each) for each in vary] if vary else standard_space(config)
     keys = [one.key for one in space]
@@ -104,7 +104,7 @@ def space_of(config: Config, vary: Sequence[str]) -> list[Dimension]:
 
 
 def standard_space(config: Config) -> list[Dimension]:
-    """The few keys that are worth a search in any task, about what a config has of them."""
+    """The few keys that matter in any task, with ranges around the config's values."""
     rate, batch, weight = config.training.learning_rate, config.training.batch_size, config.program.cost_to_go
     space: list[Dimension] = [
         Range("training.learning_rate", min(rate, RATES[0]), max(rate, RATES[1]), log=True),
@@ -121,13 +121,13 @@ def standard_space(config: Config) -> list[Dimension]:
 
 
 def given_values(config: Config, space: Sequence[Dimension]) -> dict[str, Any] | None:
-    """What a config itself has, as the space's distributions have it; None where one of its values is not in it."""
+    """The config's own values as values of the distributions; None if one of them is outside."""
     values = {one.key: one.drawn(value_of(config, one.key)) for one in space}
     return None if None in values.values() else values
 
 
 def value_of(config: Config, key: str) -> Any:
-    """What a config has under the full name of a key; None where that is not given."""
+    """The value of a key such as training.batch_size in a config; None if it is not given."""
     value: Any = to_plain(config)
     for name in key.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
@@ -135,7 +135,7 @@ def value_of(config: Config, key: str) -> Any:
 
 
 def _dimension(vary: str) -> Dimension:
-    """What one `--vary` says."""
+    """The dimension that a `--vary` option describes."""
     key, _, values = (part.strip() for part in vary.partition("="))
     low, dots, high = values.removesuffix(LOG).partition("..")
     try:
@@ -161,11 +161,11 @@ def _number(text: str) -> float:
 
 
 def _listed(values: str) -> list[Any]:
-    """The entries between commas, none within brackets."""
+    """The entries that commas separate; commas within brackets do not."""
     found: Any = OmegaConf.to_container(OmegaConf.from_dotlist([f"values=[{values}]"]))
     return found["values"]
 
 
 def _text(value: Any) -> str:
-    """A value as the command line has it."""
+    """A value as on the command line."""
     return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))

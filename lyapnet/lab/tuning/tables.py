@@ -1,4 +1,4 @@
-"""What a search shows in a terminal, and its CSV."""
+"""Tables and sentences of a search for the terminal, and its CSV."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ SHOWN = ("cost_ratio", "cost_mean", "value_error", "satisfied_fraction", "violat
 
 
 def search_rows(task: Task, study: optuna.Study) -> list[dict[str, Any]]:
-    """A row for each trial: its settings, its measure at each validation and at its best checkpoint, how it ended."""
+    """A row for each trial: settings, measure at each validation and at the best checkpoint, and state."""
     trials = study.get_trials(deepcopy=False)
     steps = sorted({step for trial in trials for step in trial.intermediate_values})
     return [
@@ -61,7 +61,7 @@ def search_table(task: Task, study: optuna.Study) -> Table:
 
 
 def summary(task: Task, study: optuna.Study) -> list[str]:
-    """What was found, against what was given, and what the number is worth."""
+    """The best trial, compared with the given config, and a warning about its number."""
     best = best_of(study)
     if best is None:
         return ["no trial came to its end"]
@@ -76,7 +76,7 @@ def summary(task: Task, study: optuna.Study) -> list[str]:
 
 
 def final_line(task: Task, training: Training) -> str:
-    """What the best settings reach from another seed on states that no trial saw."""
+    """The measures of the best settings, trained from another seed, on states that no trial used."""
     assert training.run is not None
     found = training.run.evaluation
     measures, samples = found.get("mean", found), found.get("seeds", [found])[0]["samples"]

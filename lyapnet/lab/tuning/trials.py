@@ -1,4 +1,4 @@
-"""The trainings of a search: each a process, a run's folder, and what its validations measured."""
+"""The trainings of a search: each has a process, a folder, and measures of its validations."""
 
 import shlex
 import sys
@@ -23,24 +23,24 @@ from lyapnet.training.metrics_file import STEP, read_curves
 from lyapnet.training.run_lock import RunLock
 from lyapnet.training.runs import TrainingRun, runs_of
 
-# of a trial, which is measured by its validations alone: no figures, and no test states
+# overrides for trials, which are measured by their validations: no figures, and no test states
 BRIEF = ("loggers=[csv]", "evaluation.animate=false", "evaluation.test_states=1", "evaluation.certify_every=0")
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is tuned: a config, the keys that are varied, and the folder of the search."""
+    """The task of a search: a config, the keys to vary, and a folder."""
 
     path: Path
     overrides: Sequence[str]
     space: Sequence[Dimension]
     folder: Path
     seed: int
-    compared: bool  # with the optimum
+    compared: bool  # whether the measure is the gap to the optimum, instead of the cost
 
     @property
     def measure(self) -> str:
-        """What is minimised, for readers."""
+        """The name of the measure that the search minimises."""
         return "gap" if self.compared else "cost"
 
     def config(self, settings: Sequence[str] = ()) -> Config:
@@ -48,7 +48,7 @@ class Task:
         return load_config(self.path, [*self.overrides, *settings])
 
     def settings(self, params: dict[str, Any]) -> list[str]:
-        """What was drawn, as the command line has it."""
+        """The values of a trial as overrides."""
         return [f"{one.key}={one.text(params[one.key])}" for one in self.space if one.key in params]
 
 
@@ -56,7 +56,7 @@ class Training(Runnable):
     """One `lyapnet train` in the folder of a search.
 
     Args:
-        begins_with: a checkpoint whose weights it starts from, instead of seeking its own start.
+        begins_with: a checkpoint with its first weights; None: it searches for a start itself.
     """
 
     def __init__(self, task: Task, name: str, settings: Sequence[str], begins_with: Path | None = None):
@@ -82,7 +82,7 @@ class Training(Runnable):
 
     @property
     def run(self) -> TrainingRun | None:
-        """Its run, once there is one."""
+        """Its newest run; None before the first."""
         return next(reversed(runs_of(self.config)), None)
 
     @property
@@ -97,7 +97,7 @@ class Training(Runnable):
         return [sys.executable, "-m", "lyapnet", "train", "--config", str(self.task.path), *self.settings, *further]
 
     def wait_for_others(self, say: Callable[[str], Any]) -> None:
-        """Until no process trains it: one may have outlived a search that was killed."""
+        """Wait until no other process trains it, such as one that has outlived a killed search."""
         told = False
         while (run := self.run) is not None:
             try:
@@ -111,10 +111,10 @@ class Training(Runnable):
 
 
 class Trial(Training):
-    """A training with settings that a study proposes once it begins.
+    """A training with settings that a study proposes when it starts.
 
     Args:
-        begun: the trial of an earlier process that goes on here.
+        begun: an unfinished trial of an earlier process, to continue.
         starts: settings that a start depends on ↦ its checkpoint.
     """
 
@@ -128,8 +128,8 @@ class Trial(Training):
             self._take()
 
     def ask(self) -> None:
-        """Take the settings that the study proposes; each has a sampler of its own seed, so that a search which is
-        killed and goes on proposes what it would have."""
+        """Get settings from the study, by a sampler with a seed for this trial: so a search that was killed and is
+        continued proposes the same settings."""
         if self.trial is None:
             with self.asking:
                 count = sum(one.state != TrialState.WAITING for one in self.study.get_trials(deepcopy=False))
@@ -146,7 +146,7 @@ class Trial(Training):
 
     @property
     def given_up(self) -> bool:
-        """Whether its validations are worse than those of most others."""
+        """Whether the study prunes it, because its validations are worse than most others at the same step."""
         for step, value in self._news():
             self._report(step, value)
             if step < self.config.training.iterations and self.trial.should_prune():
@@ -155,10 +155,10 @@ class Trial(Training):
         return self.pruned
 
     def end(self, failure: str) -> None:
-        """Tell the study how it ended.
+        """Report the result to the study.
 
         Args:
-            failure: the last words of its process; empty where it came to its end.
+            failure: the last message of its process; empty if it was successful.
         """
         for step, value in [] if failure else self._news():
             self._report(step, value)
@@ -174,7 +174,7 @@ class Trial(Training):
             self.study.tell(self.trial, state=TrialState.FAIL)
 
     def _news(self) -> list[tuple[int, float]]:
-        """Step and measure of the validations that the study does not know; before the first step all are alike."""
+        """(step, measure) of validations that are not reported yet, without the one before the first step."""
         return [(step, value) for step, value in sorted(self._measured().items()) if step > self._reported]
 
     def _report(self, step: int, value: float) -> None:
@@ -199,8 +199,8 @@ class Trial(Training):
         return {step: fmean(curve[step] for curve in curves) for step in common}
 
     def _curve(self, folder: Path) -> dict[int, float]:
-        """Step ↦ what is minimised: the optimality gap, or the mean cost; and more by the share of closed loops that
-        break what their training promises, be it constraints or the Lyapunov condition, which a cost does not see."""
+        """Step ↦ measure: optimality gap + r, or mean cost · (1 + r), with r the share of closed loops that violate
+        constraints, plus that of loops that violate the condition of the program lyapunov."""
         names = ("trajectory_cost/val", STEP, "optimality_gap/val", "violated_fraction/val", "satisfied_fraction/val")
         promised, found = self.config.program.name == "lyapunov", dict[int, float]()
         for cost, step, gap, violated, satisfied in read_curves(folder, *names):
@@ -212,16 +212,16 @@ class Trial(Training):
 
 
 def sampler_of(seed: int) -> optuna.samplers.BaseSampler:
-    """What proposes the settings of one trial."""
+    """A sampler of Optuna, which proposes the settings of one trial."""
     return optuna.samplers.TPESampler(seed=seed, n_startup_trials=5)
 
 
 def start_settings(settings: Sequence[str]) -> tuple[str, ...]:
-    """Those of some settings that the start of a training depends on: all but those of its optimisation."""
+    """The settings that the start of a training depends on: all but those of its optimisation."""
     apart = ("training.", "program.", "pointwise.", "trainer.")
     return tuple(one for one in settings if not one.startswith(apart) or one.startswith("training.precision="))
 
 
 def command_of(path: Path) -> str:
-    """What trains a config."""
+    """The command that trains a config."""
     return shlex.join(["lyapnet", "train", "--config", str(path)])

@@ -1,8 +1,8 @@
 """Kalman filters for the steps of a problem: extended, and unscented.
 
 No library is used. FilterPy filters one loop at a time, with NumPy; kalman-py compiles its loops with JAX; torch-kf is
-for linear systems only. Each wants F as code of its own kind, where here F and its Jacobian follow from the task's f, g
-and Δt in torch, for thousands of loops at once. What is left for a library is the linear algebra below.
+for linear systems only. Each needs F in its own form. Here F and its Jacobian follow from the task's f, g and Δt in
+torch, for thousands of loops at once, and what remains is the linear algebra below.
 """
 
 import math
@@ -23,10 +23,10 @@ from lyapnet.value.derivatives import jacobian_of
 Covariance = Float[Tensor, "*batch n n"]
 Deviations = Float[Tensor, " n"]
 
-# Random walk over the horizon relative to the first uncertainty, where no noise is known or given. Without any, P of a
-# decaying mode falls below the error of the linearisation: on the balanced cart-pole errors were 100 times P at T.
+# Random walk over the horizon, relative to the initial uncertainty, if no noise is known or given. Without it, P of a
+# decaying mode falls below the error of the linearisation: for the balanced cart-pole errors at T were 100 times P.
 AWAKE = 1e-4
-KNOWN = 1e-2  # first uncertainty of a state that X₀ fixes, relative to its size
+KNOWN = 1e-2  # initial standard deviation of a state that X₀ fixes, relative to its size
 
 
 class Belief(NamedTuple):
@@ -45,7 +45,7 @@ class KalmanFilter(nn.Module, ABC):
     Args:
         problem: F and σ.
         outputs: h and the covariance of v.
-        drift: standard deviation of a random walk that is assumed of each state besides, (n,), in its unit per √s.
+        drift: standard deviation of an additional random walk of each state, (n,), in its unit per √s.
     """
 
     problem: Problem
@@ -66,7 +66,7 @@ class KalmanFilter(nn.Module, ABC):
         """The belief after readings y."""
 
     def _next(self, x: Tensor, u: Control) -> Tensor:
-        """F(x, u), for states with more axes in front than controls."""
+        """F(x, u), for states that may have more batch axes than controls."""
         return self.problem.step(x, u.expand(*x.shape[:-1], -1))[0]
 
     def process_noise(self, x: State) -> Covariance:
@@ -120,7 +120,7 @@ class ExtendedKalmanFilter(KalmanFilter):
 
 
 class UnscentedKalmanFilter(KalmanFilter):
-    """Means and covariances over 2n states x̂ ± √n d_i, with the columns d_i of a root of P.
+    """Means and covariances of 2n states x̂ ± √n d_i, with the columns d_i of a square root of P.
 
     It is the unscented transform without a point in the centre (κ = 0), whose weights are all positive: covariances are
     semidefinite by their form. Means are exact to third order in the deviation from x̂.
@@ -164,7 +164,7 @@ def initial_deviation(problem: Problem) -> Deviations:
 
 
 def least_drift(problem: Problem) -> Deviations:
-    """A random walk that over the horizon comes to AWAKE times the initial uncertainty: it keeps the filter awake."""
+    """The drift of a random walk that amounts to AWAKE times the initial uncertainty over the horizon."""
     return AWAKE * initial_deviation(problem) / math.sqrt(problem.horizon.duration)
 
 
@@ -185,6 +185,6 @@ def _spread(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _root(P: Covariance) -> Tensor:
-    """D with DDᵀ = P, also of a P that is only semidefinite."""
+    """D with DDᵀ = P, for positive semidefinite P."""
     values, vectors = torch.linalg.eigh(P)
     return vectors * values.clamp_min(0).sqrt()[..., None, :]

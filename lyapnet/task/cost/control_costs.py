@@ -17,17 +17,17 @@ from lyapnet.task.ball import LEAST_NUMBER, ControlBall, minimise_in_ball, posit
 from lyapnet.task.polytope import ControlPolytope
 from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
-NEWTON_STEPS = 12  # of the minimiser with smooth costs, in traces
-SCALAR_STEPS = 12  # for a single control
-SCALAR_STEPS_FROM_AFAR = 40  # where no slope of the smooth costs bounds it beforehand
-MOST_NEWTON_STEPS = 60  # where values tell when it has converged
-LEAST_EXPONENT = 1.2  # closer to 1 rounding hides where the minimum is
-CONVERGED = 1e-14  # a change of u, relative to u, at which it has
-STEP_SIZES = (1.0, 0.5, 0.125, 0.0156, 0.001)  # of its line search
-LEAST_SHARE = 1e-9  # |u| at which an infinite curvature at 0 is taken, relative to the size of u
-LAST_STEPS = 2  # Newton steps without a line search, which rounding of the cost would stop
-ROOM_LEFT = 0.05  # share of the way to an open limit that one step leaves
-LEAST_ROOM = 1e-12  # distance from it, relative to the limit, that is always left
+NEWTON_STEPS = 12  # number of steps of the minimiser with smooth costs, in traces
+SCALAR_STEPS = 12  # number of steps for a single control
+SCALAR_STEPS_FROM_AFAR = 40  # the same, if a smooth cost has no `inverse_slope` that bounds the control
+MOST_NEWTON_STEPS = 60  # largest number of steps outside of traces, where convergence can be tested
+LEAST_EXPONENT = 1.2  # for smaller p the minimum is lost in rounding
+CONVERGED = 1e-14  # relative change of u below which it has converged
+STEP_SIZES = (1.0, 0.5, 0.125, 0.0156, 0.001)  # step sizes of its line search
+LEAST_SHARE = 1e-9  # |uᵢ|, relative to max |uⱼ|, that replaces 0 in curvatures that are infinite there
+LAST_STEPS = 2  # number of last Newton steps without a line search, which the rounding of the cost would end too early
+ROOM_LEFT = 0.05  # least share of the distance to an open limit that remains after a step
+LEAST_ROOM = 1e-12  # least distance from an open limit, relative to it
 
 
 class ControlCost(nn.Module, ABC):
@@ -41,12 +41,12 @@ class ControlCost(nn.Module, ABC):
 
 
 class SeparableCost(ControlCost, ABC):
-    """s(u) = Σᵢ wᵢσ(uᵢ) with σ(u) = |u|, or a smooth even function: each control pays for itself.
+    """s(u) = Σᵢ wᵢσ(uᵢ) with σ(u) = |u|, or a smooth even function: a sum of costs of single controls.
 
     A subclass of your own has `forward`, a smooth function; the other methods differentiate it.
 
     Args:
-        weight: w > 0, a number or one for each control; of absolute costs some may be 0.
+        weight: w > 0, a number or one for each control; for the absolute cost some may be 0.
     """
 
     least_weight: ClassVar[float] = LEAST_NUMBER
@@ -72,7 +72,7 @@ class SeparableCost(ControlCost, ABC):
         return derivative if recording else derivative.detach()
 
     def inverse_slope(self, b: Control) -> Control:
-        """|u| at which the slope is |b|; infinite, if the slope stays smaller."""
+        """|u| at which the slope is |b|; infinite if the slope is always smaller."""
         return torch.full_like(b, math.inf)
 
     @property
@@ -82,7 +82,7 @@ class SeparableCost(ControlCost, ABC):
 
 
 class AbsoluteCost(SeparableCost):
-    """s(u) = Σ wᵢ|uᵢ|: fuel, or the energy of an actuator that pays for what it moves."""
+    """s(u) = Σ wᵢ|uᵢ|: the fuel of thrusters, for example."""
 
     least_weight: ClassVar[float] = 0.0
 
@@ -125,7 +125,7 @@ class PseudoHuberControlCost(SeparableCost):
 
 
 class PowerCost(SeparableCost):
-    """s(u) = Σ wᵢ|uᵢ|ᵖ: losses of motors, for example, with p = 1.5.
+    """s(u) = Σ wᵢ|uᵢ|ᵖ: the losses of motors, for example, with p = 1.5.
 
     Args:
         weight: w, a number or one for each control.
@@ -241,11 +241,11 @@ class NormCost(ControlCost):
 
 
 class ControlCosts(nn.Module):
-    """s(u), the sum of some costs of controls; and of ρ‖u‖², where a search softens kinks for a while.
+    """s(u), the sum of some costs of controls, plus ρ‖u‖² while a search smooths kinks.
 
-    With limits, or without: over each of the 2ᵐ orthants costs |u| are linear, and the cheapest of their minima is the
-    minimum; smooth costs are minimised by Newton steps with a line search, each with their quadratic model. In a ball,
-    or without limits: the norm alone. The derivative is that of the minimiser.
+    The minimiser is known for separable costs in a box or without limits, and for norms in a ball or without limits.
+    Costs |u| are linear in each of the 2ᵐ orthants, and the least of the minima over these is the minimum. Smooth costs
+    are minimised by Newton's method with a line search. The derivative is that of the minimiser.
 
     Args:
         costs: the costs.
@@ -263,17 +263,17 @@ class ControlCosts(nn.Module):
 
     @property
     def separable(self) -> list[SeparableCost]:
-        """Those in which each control pays for itself."""
+        """The separable costs."""
         return [cost for cost in self.costs if isinstance(cost, SeparableCost)]
 
     @property
     def norms(self) -> list[NormCost]:
-        """Those of ‖u‖."""
+        """The costs of ‖u‖."""
         return [cost for cost in self.costs if isinstance(cost, NormCost)]
 
     @property
     def kinked(self) -> list[ControlCost]:
-        """Those whose slope jumps at u = 0."""
+        """The costs whose slope jumps at u = 0."""
         return [*self.norms, *(cost for cost in self.separable if isinstance(cost, AbsoluteCost))]
 
     @property
@@ -288,17 +288,17 @@ class ControlCosts(nn.Module):
         return value
 
     def told_apart(self, m: int) -> Control:
-        """Controls (2m, m) whose costs tell sums apart: each control by itself at two sizes below the open limits."""
+        """Controls (2m, m) at which different sums have different costs: single controls at two sizes."""
         each = torch.eye(m, dtype=torch.float64)
         for end in self.open_limits:
             each = each * (0.9 * end.double().expand(m)).clamp_max(1.0)
         return torch.cat([each, 0.3 * each])
 
     def require_minimiser(self, controls: ControlSet, m: int) -> None:
-        """Refuse costs and a set whose minimiser is not known.
+        """Check that the minimiser of these costs over a set of m controls is implemented.
 
         Raises:
-            UsageError: there is none for a control set U of m controls.
+            UsageError: it is not.
         """
         ball, box = type(controls) in (ControlBall, Unbounded), type(controls) in (ControlBox, Unbounded)
         one_kind = not self.norms or not self.separable
@@ -321,7 +321,7 @@ class ControlCosts(nn.Module):
             b: (*batch, m).
 
         Raises:
-            UsageError: it is not known for this U.
+            UsageError: it is not implemented for this U.
         """
         m = b.shape[-1]
         self.require_minimiser(controls, m)
@@ -378,7 +378,7 @@ def _minimise_one(smooth: Sequence[SeparableCost], kinks: Tensor | None, bend: T
 
 
 class _SmoothProgram:
-    """The minimum over u ∈ U of uᵀRu + bᵀu + Σ cᵢ|uᵢ| + smooth costs of each control."""
+    """The search for the minimum over u ∈ U of uᵀRu + bᵀu + Σ cᵢ|uᵢ| + smooth costs of each control."""
 
     def __init__(
         self, controls: ControlSet, smooth: Sequence[SeparableCost], kinks: Tensor | None, R: ControlMatrix, b: Control
@@ -398,7 +398,7 @@ class _SmoothProgram:
         return self._newton(u)
 
     def _start(self) -> Control:
-        """The minimum without the smooth costs, reduced to where the slope of one of these alone outweighs b."""
+        """The minimum without the smooth costs, with each |uᵢ| cut to where the slope of one of these is |bᵢ|."""
         u = _minimise_with_kinks(self.controls, self.R, self.b, self.kinks)
         for cost in self.smooth:
             size = cost.inverse_slope(self.b)
@@ -411,8 +411,8 @@ class _SmoothProgram:
         """The minimum with the quadratic model of the smooth costs at u, inside the open limits.
 
         Args:
-            cautious: whether the model is a quadratic function without uᵢ that touches the cost at ±uᵢ, where that
-                bends more than the cost does; it lies above |u|ᵖ for p < 2 and the pseudo-Huber cost.
+            cautious: whether the curvature is at least that of the even parabola with the slope of the cost at uᵢ.
+                This parabola is nowhere below |u|ᵖ with p < 2 and the pseudo-Huber cost, so that the step is safe.
         """
         u = u.detach()
         least = LEAST_SHARE * u.abs().amax(-1, keepdim=True).clamp_min(LEAST_SHARE)
@@ -451,10 +451,10 @@ class _SmoothProgram:
 def local_shape(
     cost: ControlCosts | None, controls: ControlSet, u: Control, slope: Control
 ) -> tuple[Tensor, Tensor | None]:
-    """How the minimiser u of a quadratic cost and s over U moves: (P, S), (*batch, m, m) each.
+    """(P, S), (*batch, m, m) each, for the derivative of the minimiser u of a quadratic cost and s over U.
 
-    P projects onto the directions in which it moves: not across a limit, and not out of a kink of s. S is the curvature
-    of s, and of a curved border of U, in them; None: zero.
+    P projects onto the directions in which u can move: not across a limit, and not out of a kink of s. S is the
+    curvature of s, and of a curved border of U, in these directions; None: zero.
 
     Args:
         cost: s; None: zero.
@@ -527,7 +527,7 @@ def _minimise_with_kinks(controls: ControlSet, R: ControlMatrix, b: Control, kin
 
 
 def _open_limits(costs: Sequence[SeparableCost]) -> list[Tensor]:
-    """|u| at which some of the costs are infinite."""
+    """|u| at which costs are infinite, of those that have such a limit."""
     ends = [cost.open_limit for cost in costs]
     return [end for end in ends if end is not None]
 

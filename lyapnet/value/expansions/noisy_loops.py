@@ -1,17 +1,18 @@
-"""An expansion of V around closed loops under noise, instead of one trajectory without it.
+"""An expansion of V around closed loops under noise, instead of around one trajectory without noise.
 
-Where loops spread far, the derivatives on the trajectory between them are those of states that no loop meets: at the
-top of a hill, at the tip of ln(1 + ‖x‖²) in many dimensions. Of a normal z with mean z̄ and covariance Σ, the quadratic
-function nearest to l(z) in the mean square, and the affine function nearest to F(z), are
+If loops spread far, their mean may be a state that no loop visits, such as the top of a hill, and derivatives there say
+little about the loops. For a normal z with mean z̄ and covariance Σ, the best approximations in the mean square, of l(z)
+by a quadratic and of F(z) by an affine function, are
 
     E l − ½ tr(E l_zz Σ) + E l_zᵀ(z − z̄) + ½ (z − z̄)ᵀ E l_zz (z − z̄)   and   E F + E F_z (z − z̄),
 
-and the recursion of differential dynamic programming takes them in the place of Taylor's. What F̂ leaves of F costs
-½ E (F − F̂)ᵀH(F − F̂). Loops of the law of V then give new means, and so on. A linear-quadratic task keeps its solution.
+and the recursion of differential dynamic programming uses them instead of Taylor polynomials. The error F − F̂ of the
+affine function costs ½ E (F − F̂)ᵀH(F − F̂). Loops under the law of V then give new means, and so on. For a
+linear-quadratic task the result is exact.
 
-Such an expansion knows one way to go. Noise may make another the better one, which without noise costs more:
-`expansion_of_another_way` begins with loops of random controls. Far from an optimum it leaves out the negative part of
-E l_zz, as Gauss and Newton do, and includes it where that leads to.
+Such an expansion describes one way to the goal. Under noise another may be better that costs more without noise:
+`expansion_of_another_way` starts with loops of other laws. At first it leaves out the negative part of E l_zz, as the
+Gauss–Newton method does, and includes it for the best expansion found.
 
 Source: Gelb (ed.), Applied Optimal Estimation, 1974, ch. 6 (statistical linearisation).
 """
@@ -29,13 +30,13 @@ from lyapnet.value.expansions.dynamic_programming import backward_recursion
 from lyapnet.value.expansions.laws import Expansion, at_rest, greedy_law
 from lyapnet.value.expansions.paths import Path, in_float64, path_under
 
-SWEEPS = 8  # most expansions, each around loops of the one before
-ENOUGH_GAIN = 1e-3  # relative gain of the mean cost below which they end
-MAX_LOOPS, MIN_LOOPS = 256, 32  # loops under noise in each sweep, in pairs with ΔW and −ΔW
-MAX_ENTRIES = 40_000_000  # numbers in all second derivatives of a sweep, which limits the loops
-LOOPS_OF_A_WAY = 64  # loops of each guess at another way
-MIN_GAIN_OF_A_WAY = 5e-3  # share of the mean cost that another way saves at least
-ENTRIES_AT_ONCE = 4_000_000  # the same for those computed at once
+SWEEPS = 8  # largest number of expansions, each around closed loops of the one before
+ENOUGH_GAIN = 1e-3  # relative decrease of the mean cost below which the sweeps end
+MAX_LOOPS, MIN_LOOPS = 256, 32  # largest and least number of loops in a sweep, in pairs with ΔW and −ΔW
+MAX_ENTRIES = 40_000_000  # largest number of entries in all second derivatives of a sweep; it limits the loops
+LOOPS_OF_A_WAY = 64  # number of loops of each guess at another way
+MIN_GAIN_OF_A_WAY = 5e-3  # least decrease of the mean cost by another way, relative to it
+ENTRIES_AT_ONCE = 4_000_000  # largest number of entries in second derivatives that are computed at once
 
 
 def expansion_under_noise(
@@ -47,8 +48,8 @@ def expansion_under_noise(
     """The cheapest expansion around loops under noise from random states of X₀; None if one of them is not finite.
 
     Args:
-        law: an expansion whose law gives the first loops, unless the control at rest costs less; None: there is none.
-        generator: of the states and of the noise.
+        law: an expansion whose law gives the first loops, unless u* costs less; None: take u*.
+        generator: draws the states and the noise.
     """
     loops = _Loops(problem, MAX_LOOPS, generator)
     first = loops.under([at_rest(loops.problem)])
@@ -71,12 +72,12 @@ def expansion_of_another_way(
 ) -> Expansion | None:
     """The cheapest expansion under noise that begins with loops of some laws; None if it saves too little.
 
-    Noise may make a way the best one that without noise costs more. Where derivatives of the loops take more than
-    MAX_ENTRIES numbers none is sought.
+    Under noise a way may be the best one that costs more without noise. None is searched for if derivatives of the
+    loops have more than MAX_ENTRIES entries.
 
     Args:
-        known: the expansion whose law has to cost more, by MIN_GAIN_OF_A_WAY, under the same noise.
-        guesses: laws (n, x_n) ↦ u_n, which lead different ways.
+        known: an expansion; the result costs less than its law under the same noise, by MIN_GAIN_OF_A_WAY.
+        guesses: laws (n, x_n) ↦ u_n, each for another way.
         generator: of the states and of the noise, the same for all.
     """
     loops = _Loops(problem, LOOPS_OF_A_WAY, generator)
@@ -95,7 +96,7 @@ class _Loops:
     """Closed loops under noise from random states of X₀, in pairs with ΔW and −ΔW: a group of loops for each law.
 
     Args:
-        most: how many in a group, unless their derivatives take too many numbers.
+        most: largest number in a group; less if derivatives would have more than MAX_ENTRIES entries.
     """
 
     def __init__(self, problem: Problem, most: int, generator: torch.Generator):
@@ -117,7 +118,7 @@ class _Loops:
         return self._run(law, len(laws))
 
     def _run(self, law: Callable[[int, State], Control], groups: int) -> Path:
-        """The loops of some groups under a law of all their states."""
+        """The loops of some groups under a law for the states of all groups."""
         return path_under(self.problem, law, self.x0.repeat(groups, 1), self.increments.repeat(1, groups, 1))
 
     def costs(self, path: Path) -> Tensor:

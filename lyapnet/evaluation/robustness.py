@@ -22,7 +22,7 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
 
 BEYOND = 0.2  # relative change of X₀'s extent and of each physical parameter
-EARTH = (9.7, 9.9)  # m/s²: a parameter `gravity` between these is that of the Earth, which is what it is
+EARTH = (9.7, 9.9)  # m/s²: a parameter `gravity` between these is that of the Earth, which does not vary
 NOISE = 0.01  # standard deviation of the measured x_i, relative to the largest |x_i| of the undisturbed loop
 
 
@@ -106,7 +106,7 @@ class LatePolicy(nn.Module):
     def __init__(self, policy: nn.Module, model: Problem, predicts: bool):
         super().__init__()
         self.policy, self.model, self.predicts = policy, model, predicts
-        self.computed: Control | None = None  # what acts next
+        self.computed: Control | None = None  # the control that acts next
 
     def forward(self, t: Time, x: State) -> Control:
         if t.ndim:  # all nodes at once, of a path that is known

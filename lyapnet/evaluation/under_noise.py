@@ -19,10 +19,10 @@ from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 from lyapnet.loop.rollout import NoisyTrajectory
 from lyapnet.value.risk import mean_with_risk
 
-QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
+QUANTILES = (0.05, 0.5, 0.95)  # probabilities of the reported quantiles of the costs of all paths
 ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in a mean of exponentials
-FAR_FROM_ONE = 0.1  # distance from 1 of a sample's mean whose expectation is 1, at which it says nothing
-DEAREST = 0.05  # share of a state's paths whose mean cost measures its risk
+FAR_FROM_ONE = 0.1  # distance from 1 of a sample mean with expectation 1, above which the sample is too small
+DEAREST = 0.05  # share of a state's paths, those of highest cost, whose mean cost measures its risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
 
@@ -41,7 +41,7 @@ class NoiseMeasures(NamedTuple):
     plain_mean: float  # mean of J itself
     plain_half_width: float  # of its 95 % interval
     quantiles: dict[str, float]  # of J over all states and paths, by probability
-    dearest_mean: float  # mean of J over the dearest 5 % of the paths from a state, averaged over the states
+    dearest_mean: float  # mean of J over the 5 % of paths of highest cost from a state, averaged over the states
     lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
     risk: float  # θ
     with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ); None if θ = 0 or it cannot be measured

@@ -18,8 +18,8 @@ from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.task.systems import ControlSystem
 from lyapnet.value.expansions import path_under
 
-RARE = 0.999  # probability of errors that are not rare
-MOST_OUTLIERS = 0.01  # largest share of runs with a rarer error of an estimator that counts as consistent
+RARE = 0.999  # probability up to which errors count as not rare, if P is right
+MOST_OUTLIERS = 0.01  # largest share of runs with rare errors for an estimator to count as consistent
 
 
 class EstimatedLoops(NamedTuple):

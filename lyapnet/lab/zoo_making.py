@@ -38,8 +38,8 @@ TASKS: dict[str, list[str]] = {  # name ↦ arguments of lyapnet train --config
     "cartpole_limited": ["conf/cartpole_swingup.yaml", "controls={lower: -20, upper: 20}"],
     "reacher_limited": ["conf/reacher.yaml", "controls={lower: [-1.03, -0.37], upper: [1.03, 0.37]}"],
 }
-MULTIPLES = (1, 5, 20)  # of T, at which the distance to the goal is recorded
-SAMPLES, KEPT = 256, 32  # states of the evaluation, and those whose optima the record keeps
+MULTIPLES = (1, 5, 20)  # multiples of T at which the distance to the goal is recorded
+SAMPLES, KEPT = 256, 32  # numbers of states in the evaluation, and of those whose optima are recorded
 PACKAGES = ("lyapnet", "torch", "lightning", "python")
 PRECISIONS = ("float64", "float32")
 EXPORTS = {"c": "law", "torch": "law.pt2", "onnx": "law.onnx"}
@@ -72,7 +72,7 @@ def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
 
 
 def _origin(trained: Path) -> dict[str, Any]:
-    """With what it was trained, as its run noted."""
+    """Versions and commit of a training, from its run.json."""
     run = read_json(trained.parents[1] / "run.json", "give a checkpoint in the folder of its run")
     return {"versions": {package: run[package] for package in PACKAGES}, "commit": run["commit"]}
 
@@ -95,10 +95,12 @@ def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
 
 
 def choose_law_after(checkpoint: Path) -> dict[str, Any]:
-    """Find what follows T, and note it in the checkpoint; how many other closed loops it holds up to 5 T, and their
-    mean distance to the goal at some multiples of T.
+    """Choose the law after T, and note it in the checkpoint.
+
+    Returns the choice, the number of other closed loops that it holds at the goal, and their mean distance to the goal
+    at MULTIPLES of T.
     """
-    note_in_checkpoint(checkpoint, **{AFTER_HORIZON: None})  # what was found before is not taken
+    note_in_checkpoint(checkpoint, **{AFTER_HORIZON: None})  # removes an earlier result
     controller = load(checkpoint)
     found, problem = controller.after_horizon(), controller.problem
     note_in_checkpoint(checkpoint, **{AFTER_HORIZON: found._asdict()})
@@ -110,7 +112,7 @@ def choose_law_after(checkpoint: Path) -> dict[str, Any]:
 
 
 def _agreements(checkpoint: Path, precision: str) -> dict[str, dict[str, float]]:
-    """How far each export is from the controller whose weights are rounded to that precision."""
+    """Export ↦ its differences from the controller with weights rounded to the given precision."""
     content, kind = read_checkpoint(checkpoint), getattr(torch, precision)
     content[KEY]["config"]["training"]["precision"] = precision
     weights = content["state_dict"].items()
@@ -134,7 +136,7 @@ def train(name: str, logs: Path) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Make the controllers that are named, or all."""
+    """Make the named controllers, or all."""
     parser = argparse.ArgumentParser(prog="python -m lyapnet.lab.zoo_making", description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*TASKS, []], metavar="NAME", help=", ".join(TASKS))
     parser.add_argument("--from", dest="trained", type=Path, metavar="CKPT", help="a checkpoint; of one NAME")

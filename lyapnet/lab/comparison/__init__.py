@@ -1,1 +1,1 @@
-"""Ours against reinforcement learning: the same tasks, the same states, one evaluator."""
+"""Comparison of lyapnet with reinforcement learning and planners: same tasks, same states, one evaluator."""

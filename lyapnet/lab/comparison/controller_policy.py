@@ -1,4 +1,4 @@
-"""A learned controller in the place of a policy of Stable-Baselines3."""
+"""A learned controller with the interface of a policy of Stable-Baselines3."""
 
 from collections.abc import Sequence
 from typing import Any

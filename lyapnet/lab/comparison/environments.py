@@ -1,4 +1,4 @@
-"""Every task as an environment of reinforcement learning: one trajectory, with Gymnasium's interface.
+"""Tasks as environments of reinforcement learning, with Gymnasium's interface, one trajectory each.
 
 Importing this registers them: gymnasium.make("lyapnet.lab.comparison.environments:lyapnet/Reacher-v0") does it by
 itself.
@@ -43,7 +43,7 @@ class Episodes:
         self.clipped = self.controls = 0
 
     def start(self, x0: State) -> None:
-        """Begin at x₀ (*batch, n)."""
+        """Start at x₀ (*batch, n)."""
         self.state, self.step = x0, 0
 
     def advance(self, action: np.ndarray, increment: Float[Tensor, "*batch sources"] | None = None) -> PerState:
@@ -64,7 +64,7 @@ class Episodes:
                 f"Expected actions of shape {(*self.state.shape[:-1], len(self.scale))}, got {tuple(given.shape)}; "
                 "one a_i for each control."
             )
-        self.clipped += int((given.abs() >= 1).sum())  # at the bound: learners clip before they ask
+        self.clipped += int((given.abs() >= 1).sum())  # = 1 counts, as algorithms clip actions before they step
         self.controls += given.numel()
         controls = self.problem.controls
         asked = controls.project(self.scale * given.clamp(-1, 1))
@@ -77,7 +77,7 @@ class Episodes:
         return -paid - self.problem.cost.terminal(self.state) if self.over else -paid
 
     def require_finite(self) -> None:
-        """Refuse to go on with a state that left the finite numbers.
+        """Check that the states are finite.
 
         Raises:
             DivergenceError: naming the first such state.
@@ -145,7 +145,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = {**self.metadata, "render_fps": round(1 / self.problem.horizon.dt, 3)}  # real time
         self.render_mode, self._picture = render_mode, None
         if render_mode is not None:
-            from lyapnet.evaluation.scenes import Picture  # matplotlib, which learning does without
+            from lyapnet.evaluation.scenes import Picture  # imports matplotlib, which training does not need
 
             self._picture = Picture(self.problem)
 

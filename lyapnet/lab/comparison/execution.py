@@ -1,4 +1,4 @@
-"""One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
+"""Runs a job in this process: continues its training, and measures the result like that of all other jobs."""
 
 import json
 import time
@@ -36,15 +36,15 @@ RECORD, LOCK = "job.json", "lock"
 
 
 def run_job(job: Job, console: Console) -> Result:
-    """Train what is not trained yet, measure it, and leave the result.
+    """Complete the training of a job, measure it, and write the result.
 
     Raises:
         UsageError: the folder holds another job of that name.
         LyapnetError: the training fails.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    # another process may be at it: one that outlived its parent
-    with FileLock(job.folder / LOCK, fallback_to_soft=False):  # a soft one would outlive a process that is killed
+    # another process may still run this job: one that outlived its parent
+    with FileLock(job.folder / LOCK, fallback_to_soft=False):  # a soft lock would remain if the process is killed
         require_same(job)
         if (done := job.result) is not None:
             return done
@@ -57,10 +57,10 @@ def run_job(job: Job, console: Console) -> Result:
 
 
 def require_same(job: Job) -> None:
-    """Hold a job that was begun before against what its folder was made for.
+    """Check that a job is the one that its folder was made for.
 
     Raises:
-        UsageError: it was another one.
+        UsageError: the folder belongs to another job.
     """
     record = job.folder / RECORD
     if not record.is_file():
@@ -79,7 +79,7 @@ def require_same(job: Job) -> None:
 
 
 def _description(job: Job) -> dict[str, Any]:
-    """What a result depends on."""
+    """Everything that the result depends on."""
     evaluation = [job.comparison.evaluation_states, job.comparison.evaluation_seed]
     config, bounded = to_plain(job.config), job.bounded
     scale = bounded.control_scale
@@ -93,7 +93,7 @@ def _description(job: Job) -> dict[str, Any]:
 
 
 def _with_defaults(kept: dict[str, Any]) -> dict[str, Any]:
-    """A record with the defaults of the keys that came since version 0.1."""
+    """A record with defaults for keys that were added after version 0.1."""
     if "config" in kept:
         return {**kept, "config": {**to_plain(config_from_plain(kept["config"])), "logs": ""}}
     if len(kept["task"]) == 4:
@@ -132,19 +132,19 @@ def _controller(job: Job, checkpoint: Path) -> Controller:
 
 
 def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
-    """task ↦ the controller of its first finished job of lyapnet."""
+    """Task ↦ the controller of its first finished lyapnet job."""
     found: dict[str, Controller] = {}
     for job in jobs:
         if job.method == OURS and job.task not in found and (result := job.result) is not None:
             checkpoint = Path(result.checkpoint)
-            if checkpoint.is_file():  # the results alone may have been kept
+            if checkpoint.is_file():  # a user may have kept only the results
                 found[job.task] = _controller(job, checkpoint)
     return found
 
 
 def _validations(run: TrainingRun, steps: int, before: float) -> list[Measurement]:
-    """The validations of a run, `steps` environment steps to an iteration and `before` seconds before it,
-    from its metrics.csv.
+    """The validations in metrics.csv of a run with `steps` environment steps in an iteration, and `before` seconds of
+    work before it.
 
     Raises:
         LyapnetError: the run has none there.

@@ -1,4 +1,4 @@
-"""What is compared: the schema of conf/compare.yaml, and the jobs that it consists of."""
+"""The plan of a comparison: the schema of conf/compare.yaml, and its jobs."""
 
 import sys
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ from lyapnet.lab.comparison.reference_problems import CONTROL_SCALES, BoundedPro
 from lyapnet.lab.comparison.results import LEARNED, METHODS, OURS, PLANNED, Result
 from lyapnet.lab.comparison.workers import Runnable
 
-RESULT = "result.json"  # written last: its presence says that the job is finished
+RESULT = "result.json"  # written last; a job with this file is finished
 
 
 @dataclass
 class ComparedTask:
-    """One task: what lyapnet trains on it, and what the baselines may."""
+    """One task, with the config for lyapnet and the budget of the baselines."""
 
     config: str = setting(MISSING, "The experiment of lyapnet, a YAML file; it also defines the task.")
     overrides: list[str] = setting([], "Changes to it, as key.sub=value.")
@@ -61,7 +61,7 @@ class ComparisonConfig:
 
     @property
     def folder(self) -> Path:
-        """Where the comparison is."""
+        """The folder of the comparison."""
         return Path(self.logs) / self.comparison
 
 
@@ -92,7 +92,7 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
 
 @dataclass(frozen=True, eq=False)
 class Job(Runnable):
-    """A method on a task, trained from a seed if it is to be, in a folder of its own."""
+    """A method on a task, with a seed if it is trained, in its own folder."""
 
     comparison: ComparisonConfig
     task: str
@@ -102,27 +102,27 @@ class Job(Runnable):
 
     @property
     def name(self) -> str:
-        """task/method/seed_k, which is also its place below the comparison's folder."""
+        """task/method/seed_k, which is also its path in the comparison's folder."""
         return f"{self.task}/{self.method}/seed_{self.seed}"
 
     @property
     def folder(self) -> Path:
-        """Where its checkpoints, curves and result are."""
+        """The folder of its checkpoints, curves and result."""
         return self.comparison.folder / self.name
 
     @property
     def command(self) -> list[str]:
-        """What runs this job alone."""
+        """The command that runs this job."""
         return [sys.executable, "-m", "lyapnet", *self.origin, "--job", self.name]
 
     @property
     def finished(self) -> bool:
-        """Whether it has left its result."""
+        """Whether its result exists."""
         return (self.folder / RESULT).is_file()
 
     @property
     def result(self) -> Result | None:
-        """What it left, if it is finished."""
+        """Its result; None if it is not finished."""
         return Result.read(self.folder / RESULT) if self.finished else None
 
     @property
@@ -153,7 +153,7 @@ class Job(Runnable):
 
     @property
     def baseline(self) -> Baseline:
-        """What SB3 trains.
+        """The baseline that SB3 trains.
 
         Raises:
             UsageError: no number of steps, or no control scale.
@@ -167,7 +167,7 @@ class Job(Runnable):
         )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse what cannot be trained or planned, before anything is.
+        """Check that the job can be trained or planned.
 
         Raises:
             UsageError: see `config`, `baseline` and planner_of.
@@ -187,7 +187,7 @@ def jobs_of(
     seeds: int | None = None,
     check: bool = True,
 ) -> list[Job]:
-    """The jobs of a comparison, or of some of its tasks and methods; seed by seed, so that all grow together.
+    """The jobs of a comparison, or of some of its tasks and methods, ordered by seed, so that all methods progress.
 
     Raises:
         UsageError: a task or method that it does not have, or one without steps; or a job that cannot be trained.
@@ -200,7 +200,7 @@ def jobs_of(
             raise UsageError(f"Expected {method} under steps of a task, got none; give its environment steps.")
     tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
     count = {m: seeds or (config.seeds if m == OURS else config.baseline_seeds) for m in methods}
-    count |= {m: 1 for m in methods if m in PLANNED}  # which draw nothing
+    count |= {m: 1 for m in methods if m in PLANNED}  # these are deterministic
     jobs = [
         Job(config, task, method, seed)
         for seed in range(max(count.values()))

@@ -1,4 +1,4 @@
-"""How far the jobs of a comparison are, and how long they will still take."""
+"""The progress of the jobs of a comparison, and an estimate of the time left."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from lyapnet.training.stage_messages import StageReport, silent
 def progress(
     jobs: Sequence[Job], total: int, workers: int, console: Console, report: StageReport = silent
 ) -> Iterator[tuple[Callable[[Job], None], Callable[[Outcome[Job]], None]]]:
-    """A line for each job that ends, and in a terminal a bar with what runs and the time left.
+    """Prints a line for each job that ends, and in a terminal a bar with the running jobs and the time left.
 
     Args:
         report: is told what runs.
@@ -30,7 +30,7 @@ def progress(
 
     def left() -> str:
         now = time.monotonic()
-        running = {one: now - start for one, start in list(starts.items())}  # jobs begin while the bar is drawn
+        running = {one: now - start for one, start in list(starts.items())}  # a copy, as jobs start in other threads
         seconds = seconds_left(jobs, running, dict(took), workers)
         return "time left unknown" if seconds is None else f"{duration(seconds)} left"
 
@@ -61,7 +61,7 @@ def progress(
 
 
 class TimeLeft(ProgressColumn):
-    """What a function says of the time left, each time that the bar is drawn."""
+    """A column of the bar with the time left, from a function."""
 
     def __init__(self, left: Callable[[], str]):
         super().__init__()
@@ -74,7 +74,7 @@ class TimeLeft(ProgressColumn):
 def seconds_left(
     jobs: Sequence[Job], begun: Mapping[Job, float], took: Mapping[Job, float], workers: int
 ) -> float | None:
-    """Seconds until all jobs are finished, judged by those that are; None while nothing tells.
+    """Estimated seconds until all jobs are finished, from those that are; None if this is not possible yet.
 
     A job takes as long as others of its task and method did, or else of its method, or else of any.
 
@@ -94,7 +94,7 @@ def seconds_left(
 
 
 def duration(seconds: float) -> str:
-    """Seconds for readers: 2 h 5 min, 3 min 4 s, 7 s."""
+    """Seconds as text: 2 h 5 min, 3 min 4 s, 7 s."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -1,4 +1,4 @@
-"""The four reference tasks as data, for environments that are made by name: what conf/ trains, wherever lyapnet is."""
+"""The four reference tasks of conf/ as data, so that environments can be made by name in an installed lyapnet."""
 
 from collections.abc import Sequence
 from math import pi
@@ -111,6 +111,6 @@ def _build(task: str | Path | None) -> Problem:
         if not str(task).endswith((".yaml", ".yml")):
             raise UsageError(f"Expected a task as one of {', '.join(TASKS)}, or a config file, got {str(task)!r}.")
         return build_problem(load_config(task))
-    # what a config must name besides its task plays no part in an environment
+    # environments do not use the other required keys of a config
     trained = {"experiment": str(task), "program": {"name": "value"}, "network": {"name": "fcn"}}
     return build_problem(config_from_plain({**TASKS[str(task)], **trained}))

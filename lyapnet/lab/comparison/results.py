@@ -1,4 +1,4 @@
-"""What one job of a comparison leaves behind: what a method costs on a task, and how it was trained, if it was."""
+"""Results of jobs of a comparison: the cost of a method on a task, and its training."""
 
 import json
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from lyapnet.base.files import read_file, write_json
 
 OURS = "lyapnet"
 LEARNED = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
-WITH_VALUE = "mpc_V_"  # MPC of so many steps, whose terminal cost is the V of lyapnet's first seed
-PLANNED = (  # from the model, without training of their own; MPC without V: % of T
+WITH_VALUE = "mpc_V_"  # prefix of MPC with a number of steps and the V of lyapnet's first seed as terminal cost
+PLANNED = (  # laws from the model, without their own training; numbers of MPC without V are % of T
     "rest", "lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100", f"{WITH_VALUE}5", f"{WITH_VALUE}10",
 )  # fmt: skip
 METHODS = (*LEARNED, *PLANNED)  # the order of tables and figures
@@ -33,7 +33,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class ControlTimes:
-    """Milliseconds that one control took, of one state at a time on one thread."""
+    """Milliseconds for one control, for one state at a time on one thread."""
 
     median: float
     most: float  # the 99.9th percentile
@@ -41,7 +41,7 @@ class ControlTimes:
 
     @staticmethod
     def of(seconds: Sequence[float], first: Sequence[float] = ()) -> "ControlTimes":
-        """Those of some controls, and of the first ones of several closed loops."""
+        """The latency of some controls, and of the first ones of several closed loops."""
         median, most = np.quantile(seconds, (0.5, 0.999)).tolist()
         return ControlTimes(1e3 * median, 1e3 * most, 1e3 * float(np.median(first)) if len(first) else None)
 
@@ -69,12 +69,12 @@ class Result:
     path_costs: Sequence[Sequence[float]] | None = None  # J_N of each path of noise (paths, states); `costs` are means
 
     def write(self, path: Path) -> None:
-        """As JSON, all or nothing: its presence says that the job is finished."""
+        """Write the result as JSON, completely or not at all; a job with this file is finished."""
         write_json(path, asdict(self))
 
     @staticmethod
     def read(path: Path) -> "Result":
-        """The result that `write` left."""
+        """Read the result that `write` wrote."""
         content: dict[str, Any] = json.loads(read_file(path))
         curve, times = [Measurement(**point) for point in content["curve"]], content.get("times")
         return Result(**{**content, "curve": curve, "times": times and ControlTimes(**times)})

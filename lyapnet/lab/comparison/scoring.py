@@ -1,4 +1,4 @@
-"""The one evaluator of a comparison: what a policy costs from each of a batch of states, and the optimum there.
+"""The evaluator of a comparison: the cost of a policy from each of a batch of states, and the optimum.
 
 With noise a cost is the mean over paths of it, the same for every policy.
 """
@@ -22,7 +22,7 @@ PathIncrements = Float[Tensor, "steps paths b sources"]  # ΔW, in √s
 
 
 class Costs(NamedTuple):
-    """What a policy costs from each of a batch (b,) of states."""
+    """The costs of a policy from each of a batch (b,) of states."""
 
     cost: PerState  # J_N = Δt Σℓ_n + φ; ∞ where the closed loop left the finite numbers
     sum: PerState  # Σℓ_n + φ, as the paper has it
@@ -71,7 +71,7 @@ def _costs_of_loops(
         cost, start = cost - episodes.advance(action, increment), np.zeros(len(x0), dtype=bool)
         lost = ~torch.isfinite(episodes.state).all(-1)
         cost[lost] = torch.inf
-        episodes.state[lost] = 0  # a policy cannot be asked about what is no number
+        episodes.state[lost] = 0  # policies may fail for NaN
     terminal = bounded.problem.cost.terminal(episodes.state)
     cost = torch.nan_to_num(cost, nan=torch.inf, posinf=torch.inf)
     return Costs(cost, (cost - terminal) / dt + terminal, episodes.clipped_fraction)
@@ -84,7 +84,7 @@ def optima_of(bounded: BoundedProblem, x0: State) -> PerState | None:
 
 
 def why_no_optimum(bounded: BoundedProblem) -> str | None:
-    """What keeps J* of a task from being known; None if nothing does."""
+    """The reason why J* of a task cannot be computed; None if it can."""
     try:
         oracle_of(bounded.problem)
     except OracleError as error:

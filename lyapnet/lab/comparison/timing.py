@@ -1,4 +1,4 @@
-"""How long one control takes: of one state at a time, on one thread."""
+"""The time for one control, for one state at a time on one thread."""
 
 import contextlib
 import importlib.util
@@ -23,7 +23,7 @@ CALLS = 1000
 
 
 def times_of_policy(policy: Any, bounded: BoundedProblem, observe_time: bool, x0: State) -> ControlTimes:
-    """Of a policy with SB3's `predict`, at t = 0 of each of x₀ in turn."""
+    """The latency of a policy with SB3's `predict`, at t = 0 for each of x₀ in turn."""
     episodes = Episodes(bounded, observe_time)
     episodes.start(x0)
     observations = episodes.observation
@@ -35,9 +35,9 @@ def times_of_policy(policy: Any, bounded: BoundedProblem, observe_time: bool, x0
 
 
 def times_of_controller(controller: Controller, x0: State) -> ControlTimes:
-    """Of a learned law, as machine code where there is a compiler for it, else as it is in Python."""
+    """The latency of a learned law, as machine code if there is a compiler, else in Python."""
     law: Callable[..., NDArray] = controller.policy
-    with contextlib.suppress(LyapnetError):  # where there is no compiler, or the law has no C
+    with contextlib.suppress(LyapnetError):  # if there is no compiler, or no C for the law
         law = compiled(controller).policy
     states, times = x0.double().cpu().numpy(), np.linspace(0, controller.horizon.duration, CALLS, endpoint=False)
     return _times(lambda k: law(times[k], states[k % len(states)]))
@@ -73,7 +73,7 @@ def alternatives(controller: Controller) -> dict[str, Callable[[float, NDArray],
 
 
 def _times(ask: Callable[[int], Any]) -> ControlTimes:
-    ask(0)  # what is done but once is not counted
+    ask(0)  # work of the first call is not counted
     taken = []
     for k in range(CALLS):
         began = time.perf_counter()

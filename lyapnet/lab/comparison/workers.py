@@ -1,4 +1,4 @@
-"""Jobs side by side: in processes of this machine, or on a Ray cluster. Each is a command of its own."""
+"""Runs jobs, each a command, in parallel processes of this machine or on a Ray cluster."""
 
 import contextlib
 import os
@@ -17,35 +17,35 @@ from lyapnet.base.cluster import connected
 from lyapnet.base.errors import one_line
 
 LOG = "job.log"
-ASKED_EVERY = 1.0  # seconds, whether a job that runs is still wanted
+ASKED_EVERY = 1.0  # seconds between checks of whether a running job is given up
 
 
 class Runnable(ABC):
-    """What can be run side by side: a command, the folder that its output goes to, and whether its work is done."""
+    """A job: a command, the folder of its output, and whether its work is done."""
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """How users tell it from others."""
+        """Its name in messages."""
 
     @property
     @abstractmethod
     def folder(self) -> Path:
-        """Where job.log is."""
+        """The folder of job.log."""
 
     @property
     @abstractmethod
     def command(self) -> Sequence[str]:
-        """What does the work, or goes on with it; asked for when the job starts."""
+        """The command that does or continues the work; computed when the job starts."""
 
     @property
     @abstractmethod
     def finished(self) -> bool:
-        """Whether the work is done; the command's exit status alone does not say so."""
+        """Whether the work is done, in addition to the exit status."""
 
     @property
     def given_up(self) -> bool:
-        """Whether it is to leave before its end; asked while it runs."""
+        """Whether to stop the job early; checked while it runs."""
         return False
 
 
@@ -54,17 +54,17 @@ J = TypeVar("J", bound=Runnable)
 
 @dataclass(frozen=True)
 class Outcome(Generic[J]):
-    """How a job ended."""
+    """The outcome of a job."""
 
     job: J
     seconds: float
-    failure: str  # its last words; empty where it came to its end
+    failure: str  # its last message; empty if it was successful
 
 
 def run_jobs(
     jobs: Sequence[J], workers: int, ray: str | None = None, begun: Callable[[J], Any] = lambda job: None
 ) -> Iterator[Outcome[J]]:
-    """The outcomes as they come: of `workers` processes at a time, or of the Ray cluster at an address.
+    """Yield outcomes as jobs end, of `workers` processes at a time, or of the Ray cluster at an address.
 
     Args:
         begun: called with each job that starts.
@@ -76,7 +76,7 @@ def run_jobs(
 
 
 def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> Generator[Outcome[J], None, None]:
-    """The outcomes as they come, of `workers` processes at a time; closing the generator stops them.
+    """Yield outcomes as jobs end, of `workers` processes at a time; closing the generator stops them.
 
     Args:
         begun: called with each job that starts.
@@ -86,7 +86,7 @@ def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> G
 
     def started(process: subprocess.Popen) -> None:
         processes.append(process)
-        if stopping.is_set():  # while it started
+        if stopping.is_set():  # set while the process started
             process.terminate()
 
     def run(job: J) -> Outcome[J]:
@@ -99,7 +99,7 @@ def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> G
         while waiting:
             ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             yield from (future.result() for future in ended)
-    finally:  # also when the user interrupts: nothing more is started, and what runs is told to leave
+    finally:  # also if the user interrupts: no more jobs are started, and running ones are stopped
         stopping.set()
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -108,7 +108,7 @@ def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> G
 
 
 def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> Iterator[Outcome[J]]:
-    """The outcomes as they come, of a Ray cluster whose machines share this folder; a core for each job.
+    """Yield outcomes as jobs end, on a Ray cluster whose machines share this folder; a core for each job.
 
     Args:
         address: where the cluster is, as of lyapnet.base.cluster.connected.
@@ -128,18 +128,18 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
             job = waiting.pop(ended)
             try:
                 yield Outcome(job, *ray.get(ended))
-            except ray.exceptions.RayError as error:  # a machine was lost: the others go on
+            except ray.exceptions.RayError as error:  # a machine was lost; the others continue
                 yield Outcome(job, 0.0, one_line(error))
 
 
 def _run_in(job: Runnable, place: Path) -> tuple[float, str]:
-    """run_process in a working directory, in a process that does nothing else."""
+    """run_process in a working directory, in its own process."""
     with contextlib.chdir(place):
         return run_process(job)
 
 
 def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lambda process: None) -> tuple[float, str]:
-    """Run a job on one thread, its output appended to job.log; seconds, and its last words if it failed."""
+    """Run a job on one thread, appending its output to job.log; return seconds, and its last message if it failed."""
     job.folder.mkdir(parents=True, exist_ok=True)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     begun, log = time.perf_counter(), job.folder / LOG
@@ -158,7 +158,7 @@ def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lamb
 
 
 def _status(process: subprocess.Popen, job: Runnable) -> int:
-    """With which status the process of a job ends, which is told to leave once the job is given up."""
+    """The exit status of the process of a job, which is stopped if the job is given up."""
     while True:
         try:
             return process.wait(ASKED_EVERY)

@@ -1,4 +1,4 @@
-"""Whether readings tell the state: the observability Gramian and the filter's covariance along closed loops."""
+"""Observability of the state along closed loops: the observability Gramian, and the covariance of the filter."""
 
 from typing import NamedTuple
 
@@ -13,18 +13,17 @@ SEEN = 1e-6  # displacement of all readings by a direction of x₀, in their noi
 
 
 class Observability(NamedTuple):
-    """What readings tell, in the system linearised along some closed loops.
+    """Observability of the system linearised along some closed loops.
 
-    W = Σ_k Φ_kᵀH_kᵀR⁻¹H_kΦ_k is the observability Gramian, with x₀ in units of its standard deviation before any
-    reading: the readings of the horizon tell a direction of x₀ better than that where its eigenvalue exceeds 1. For
-    control it matters what is known of the present state, and a direction that decays needs no reading: hence the
-    uncertainty at T.
+    W = Σ_k Φ_kᵀH_kᵀR⁻¹H_kΦ_k is the observability Gramian, with x₀ in units of its initial standard deviation. In a
+    direction with an eigenvalue above 1 the readings of the horizon determine x₀ better than this. For control the
+    present state matters, and directions that decay need no reading: therefore the uncertainty at T is given too.
     """
 
     rank: int  # least rank of W over the loops
     condition: float  # largest ratio of the extreme eigenvalues of W; infinite if not all of x₀ is seen
     deviation: Deviations  # √P of each state after the last reading, root mean square over the loops
-    of_first: Deviations  # the same without process noise: what is left of the uncertainty of x₀
+    of_first: Deviations  # the same without process noise: the part by the uncertainty of x₀
 
 
 def observability(

@@ -18,9 +18,9 @@ from lyapnet.lab.comparison.baselines.settings import SETTINGS, Setting
 from lyapnet.lab.comparison.baselines.vector_environment import VectorEnvironment
 from lyapnet.lab.comparison.reference_problems import BoundedProblem
 
-VALIDATIONS = 40  # validations of a training, unless told otherwise
-BUFFER = 1_000_000  # transitions that SAC remembers at most
-MINIBATCHES = 8  # minibatches of a rollout of PPO, where its options do not say
+VALIDATIONS = 40  # default number of validations in a training
+BUFFER = 1_000_000  # largest number of transitions in the replay buffer of SAC
+MINIBATCHES = 8  # default number of minibatches of a rollout of PPO
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Baseline:
     seed: int
     steps: int
     hidden: Sequence[int]
-    options: Mapping[str, Any] = field(default_factory=dict)  # in place of those of the setting
-    validations: int = VALIDATIONS  # spread evenly over its steps: the training's pieces
+    options: Mapping[str, Any] = field(default_factory=dict)  # replace those of the setting
+    validations: int = VALIDATIONS  # number of pieces of its training, each followed by a validation
 
     @property
     def setting(self) -> Setting:
@@ -65,7 +65,7 @@ class Baseline:
 
     @property
     def piece(self) -> int:
-        """Environment steps between validations: whole episodes of PPO, whole updates of SAC, of all trajectories."""
+        """Environment steps of all trajectories between validations: whole episodes of PPO, whole updates of SAC."""
         on_policy = issubclass(self.setting.algorithm, OnPolicyAlgorithm)
         whole = self.setting.environments * (self.bounded.problem.horizon.steps if on_policy else self.update)
         return whole * max(1, round(self.steps / self.validations / whole))
@@ -91,18 +91,18 @@ class Baseline:
         )  # fmt: skip
 
     def wrapped(self, environment: VectorEnvironment, normalisation: Path | None = None) -> VecEnv:
-        """The same with returns recorded and, where the setting says so, normalised as kept in a file or afresh."""
+        """The environments with a record of returns, and with normalisation, restored or new, if the setting has it."""
         monitored = VecMonitor(environment)
         if not self.setting.normalise:
             return monitored
         if normalisation is not None:
             return VecNormalize.load(str(normalisation), monitored)
-        # rewards are scaled and not clipped: the terminal cost of a bad policy is what it has to learn from
+        # rewards are scaled but not clipped, because the large terminal cost of a bad policy has to be learned
         return VecNormalize(monitored, gamma=self.options_of_algorithm["gamma"], clip_obs=100, clip_reward=np.inf)
 
     @property
     def options_of_algorithm(self) -> dict[str, Any]:
-        """The setting's, and what replaces them; those of its network one by one."""
+        """The options of the setting with replacements, also of single options of the network."""
         merged = {**self.setting.options, **self.options}
         policies = (options.get("policy_kwargs", {}) for options in (self.setting.options, self.options))
         return {**merged, "policy_kwargs": dict(ChainMap(*reversed([*policies]), {"net_arch": list(self.hidden)}))}

@@ -32,18 +32,18 @@ class BaselinePolicy(NamedTuple):
 
 
 class Checkpoint(NamedTuple):
-    """A folder step_<environment steps> with all that a training needs to go on as if it had never stopped."""
+    """A folder step_<environment steps> from which a training continues as if it had not been stopped."""
 
     folder: Path
 
     @property
     def step(self) -> int:
-        """Environment steps."""
+        """The number of environment steps before it."""
         return int(self.folder.name.removeprefix("step_"))
 
     @property
     def progress(self) -> dict[str, Any]:
-        """Seconds, validations, and the step of the best one, so far."""
+        """Seconds and validations so far, and the step of the best validation."""
         return read_json(self.folder / PROGRESS, self._remedy)
 
     @property
@@ -51,7 +51,7 @@ class Checkpoint(NamedTuple):
         return f"remove {str(self.folder.parent)!r}, and the same command trains it again"
 
     def seal(self) -> None:
-        """Keep a digest of every file, by which `file` knows what this comparison wrote."""
+        """Write a digest of every file, with which `file` checks that it is unchanged."""
         write_json(self.folder / DIGESTS, {path.name: digest_of_file(path) for path in self.folder.iterdir()})
 
     def file(self, name: str) -> Path | None:
@@ -68,14 +68,14 @@ class Checkpoint(NamedTuple):
         return path
 
     def policy(self, baseline: Baseline) -> BaselinePolicy:
-        """The policy as it was then, of weights alone."""
+        """The policy at this step, from weights alone."""
         environment = baseline.wrapped(baseline.environment(), self.file(NORMALISATION))
         model = baseline.model(environment)
         model.set_parameters(str(self.file(MODEL)), device="cpu")
         return BaselinePolicy(model, environment if isinstance(environment, VecNormalize) else None)
 
     def model(self, baseline: Baseline, environment: VecEnv) -> BaseAlgorithm:
-        """The model as it was then, with all that its training goes on from."""
+        """The model at this step, with everything that its training continues from."""
         with warnings.catch_warnings():  # SB3 takes its own buffer of returns of several steps for the user's
             warnings.filterwarnings("ignore", ".*n_steps=.* is ignored because a custom.*")
             path = str(self.file(MODEL))
@@ -83,12 +83,12 @@ class Checkpoint(NamedTuple):
 
 
 def checkpoints(folder: Path) -> list[Checkpoint]:
-    """Those of a training, oldest first."""
+    """The checkpoints of a training, oldest first."""
     found = [Checkpoint(path) for path in (folder / "checkpoints").glob("step_*")]
     return sorted(found, key=lambda checkpoint: checkpoint.step)
 
 
 def best_checkpoint(folder: Path) -> Checkpoint:
-    """That of the least validation cost."""
+    """The checkpoint with the least validation cost."""
     *_, last = checkpoints(folder)
     return Checkpoint(last.folder.with_name(f"step_{last.progress['best']}"))

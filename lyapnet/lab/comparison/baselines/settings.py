@@ -1,4 +1,4 @@
-"""How each baseline is trained: the paper's setting, and the fairest that we know."""
+"""The settings of each baseline: that of the paper, and the best that we know."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 @dataclass(frozen=True)
 class Setting:
-    """An algorithm of SB3 with its options, and what it sees of the task."""
+    """An algorithm of SB3 with its options, and its form of the task."""
 
     algorithm: type[BaseAlgorithm]
     environments: int  # trajectories in a batch
@@ -18,7 +18,7 @@ class Setting:
     normalise: bool  # observations and rewards by running means and deviations (SB3's VecNormalize)
     truncates: bool  # SB3 adds its own estimate of what lies beyond the horizon; see VectorEnvironment
     decays: bool  # the learning rate falls linearly to 0
-    options: Mapping[str, Any]  # what the algorithm is built with
+    options: Mapping[str, Any]  # arguments of the algorithm
 
 
 SETTINGS: dict[str, Setting] = {

@@ -1,4 +1,4 @@
-"""A baseline is trained in pieces, each followed by a validation and a checkpoint."""
+"""Trains a baseline in pieces, each followed by a validation and a checkpoint."""
 
 import shutil
 import tempfile
@@ -36,12 +36,12 @@ from lyapnet.lab.comparison.baselines.checkpoints import (
 from lyapnet.lab.comparison.results import Measurement
 from lyapnet.lab.comparison.scoring import costs_of, increments_of, optima_of
 
-VALIDATION_STATES = 64  # those of a lyapnet run of the same seed
-VALIDATION_PATHS = 4  # of noise from each
+VALIDATION_STATES = 64  # number of states; they are those of a lyapnet run with the same seed
+VALIDATION_PATHS = 4  # number of paths of noise from each state
 
 
 class BaselineTraining:
-    """A training in a folder of its own; it goes on from the last checkpoint in it, if there is one."""
+    """A training in its own folder; it continues from the last checkpoint there, if there is one."""
 
     def __init__(self, baseline: Baseline, folder: Path):
         self.baseline, self.folder = baseline, folder
@@ -51,7 +51,7 @@ class BaselineTraining:
         self.optima = optima_of(baseline.bounded, self.states)
         self.episodes, self.seconds, self.best = baseline.environment(), 0.0, 0
         self.curve: list[Measurement] = []
-        for draft in folder.glob("checkpoints/.new_*"):  # killed while it was written
+        for draft in folder.glob("checkpoints/.new_*"):  # incomplete: the process was killed while it wrote
             shutil.rmtree(draft)
         kept = checkpoints(folder)
         if kept:
@@ -75,27 +75,27 @@ class BaselineTraining:
             self._learn()
             report(self._validate())
             self._save()
-        for leftover in self.folder.glob(f"checkpoints/*/{REPLAY}"):  # tens of MB, to go on from
+        for leftover in self.folder.glob(f"checkpoints/*/{REPLAY}"):  # tens of MB, needed only to continue
             leftover.unlink()
 
     @property
     def policy(self) -> BaselinePolicy:
-        """The policy as it is."""
+        """The present policy."""
         return BaselinePolicy(self.model, self.environment if isinstance(self.environment, VecNormalize) else None)
 
     def _learn(self) -> None:
-        """One piece; the learning rate is constant over it."""
+        """Train one piece, with a constant learning rate."""
         remaining = 1 - self.model.num_timesteps / self.baseline.steps
         rate = self.baseline.options_of_algorithm["learning_rate"]
         now = rate * remaining if self.baseline.setting.decays else rate
         self.model.lr_schedule = lambda _: now
         started = time.process_time()  # as lyapnet.training.curves.Stopwatch
-        never = self.baseline.steps + 1  # what SB3 has to log goes with our own validations
+        never = self.baseline.steps + 1  # SB3's log is written with our validations instead
         self.model.learn(self.baseline.piece, reset_num_timesteps=False, log_interval=never)
         self.seconds += time.process_time() - started
 
     def _validate(self) -> Measurement:
-        """The policy on the validation states, logged under the tags of a lyapnet run."""
+        """Evaluate the policy on the validation states, and log the result under the tags of a lyapnet run."""
         setting, model = self.baseline.setting, self.model
         costs = costs_of(self.policy, self.baseline.bounded, setting.observe_time, self.states, self.increments)
         cost = float(costs.cost.mean())
@@ -120,7 +120,7 @@ class BaselineTraining:
         return self.curve[-1]
 
     def _save(self) -> None:
-        """A checkpoint, all or nothing; the best one and the last one are kept."""
+        """Write a checkpoint completely or not at all; keep the best and the last one."""
         root = self.folder / "checkpoints"
         root.mkdir(parents=True, exist_ok=True)
         draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
@@ -142,7 +142,7 @@ class BaselineTraining:
                 (checkpoint.folder / REPLAY).unlink(missing_ok=True)
 
     def _begun(self) -> dict[str, torch.Tensor]:
-        """What SB3's wrappers know of the episodes that have begun, and leave out of their files; its own memory."""
+        """The part of the state of SB3's wrappers for unfinished episodes that their own files lack."""
         wrapper: Any = self.environment
         known = {}
         if isinstance(wrapper, VecNormalize):
@@ -166,13 +166,13 @@ class BaselineTraining:
 
 
 def best_policy(baseline: Baseline, folder: Path) -> tuple[Path, BaselinePolicy]:
-    """The model file of a training's best checkpoint, and its policy."""
+    """(model file, policy) of a training's best checkpoint."""
     checkpoint = best_checkpoint(folder)
     return checkpoint.folder / MODEL, checkpoint.policy(baseline)
 
 
 def _logger(folder: Path, resumed_at: int | None) -> Logger:
-    """SB3's logger for TensorBoard, in which what was logged after the step of a resumption is not shown."""
+    """SB3's logger for TensorBoard, which hides entries after the step from which training continues."""
     if resumed_at is not None:
         _wait_for_another_second(folder)
     output = TensorBoardOutputFormat(str(folder))
@@ -184,8 +184,10 @@ def _logger(folder: Path, resumed_at: int | None) -> Logger:
 
 
 def _wait_for_another_second(folder: Path) -> None:
-    """Wait until a new event file comes after those that are there: they are read in the order of their names, of which
-    the second is a number of ten digits, and what tells files of one second apart is not in that order.
+    """Wait for the next full second, so that a new event file has a later name than those in the folder.
+
+    Files are read in the order of their names, which contain the time in seconds. Names of the same second are not in
+    the order of time.
     """
     seconds = [int(path.name.split(".")[3]) for path in folder.glob("events.out.tfevents.*")]
     while seconds and time.time() < max(seconds) + 1:
@@ -193,13 +195,13 @@ def _wait_for_another_second(folder: Path) -> None:
 
 
 def _mean_return(model: BaseAlgorithm) -> float | None:
-    """Mean cost of the last episodes of the training, exploration included."""
+    """Mean cost of the last episodes in training, with exploration."""
     returns = [episode["r"] for episode in model.ep_info_buffer or ()]
     return -float(np.mean(returns)) if returns else None
 
 
 def _random_streams() -> dict[str, Any]:
-    """The state of the generators that SB3 draws from."""
+    """The state of the random generators of SB3."""
     numpy: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     key = torch.from_numpy(numpy["state"]["key"].astype(np.int64))
     drawn = {"pos": numpy["state"]["pos"], "has_gauss": numpy["has_gauss"], "gauss": numpy["gauss"]}

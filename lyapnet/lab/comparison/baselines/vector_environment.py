@@ -54,7 +54,7 @@ class VectorEnvironment(VecEnv):
         return self.start(self.episodes.problem.initial_states.sample(self.num_envs, self.generator))
 
     def start(self, x0: State) -> np.ndarray:
-        """Begin at x₀ (num_envs, n) instead of states drawn from X₀; the first observations."""
+        """Start at x₀ (num_envs, n) instead of random states of X₀; return the first observations."""
         self.episodes.start(x0)
         return self.episodes.observation
 
@@ -77,7 +77,7 @@ class VectorEnvironment(VecEnv):
         return observation, rewards, np.full(self.num_envs, over), infos
 
     def position(self) -> dict[str, Any]:
-        """Where the trajectories and their draws are, for `resume`."""
+        """The state of the trajectories and of the random generator, for `resume`."""
         episodes = self.episodes
         return {
             "state": episodes.state, "step": episodes.step, "generator": self.generator.get_state(),
@@ -85,7 +85,7 @@ class VectorEnvironment(VecEnv):
         }  # fmt: skip
 
     def resume(self, position: dict[str, Any]) -> None:
-        """Go on from a `position`, whatever seed was asked for since."""
+        """Continue from a `position`, regardless of seeds that were set since."""
         self._reset_seeds()
         self.generator.set_state(position["generator"])
         for name in ("state", "step", "clipped", "controls"):

@@ -1,4 +1,4 @@
-"""What controls a task by its model without training: no control, LQR, iLQR, and model predictive control."""
+"""Laws from the model without training: no control, LQR, iLQR, and model predictive control."""
 
 import importlib.util
 

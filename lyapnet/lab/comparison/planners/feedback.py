@@ -20,7 +20,7 @@ from lyapnet.value.expansions import (
 
 
 class Rest(Planner):
-    """The control of U nearest to that which costs nothing."""
+    """The projection of u* onto U."""
 
     def __init__(self, problem: Problem):
         self.problem = copied(problem)

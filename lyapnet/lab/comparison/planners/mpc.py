@@ -18,12 +18,12 @@ from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import riccati
 
 SOLVER, ITERATIONS, TOLERANCE = "fatrop", 1000, 1e-6
-LEAST = 5  # steps of a horizon: fatrop does not converge on shorter ones of tasks with many states
+LEAST = 5  # least number of steps of a horizon: on shorter ones with many states fatrop does not converge
 QUIET = {"print_time": False, "show_eval_warnings": False, "fatrop.print_level": 0}
 
 
 class TerminalCost(NamedTuple):
-    """What follows the horizon.
+    """The terminal cost of the horizon.
 
     Args:
         function: (x, parameters) ↦ its cost.
@@ -83,7 +83,7 @@ class PredictiveControl(Planner):
 
     @property
     def _rest(self) -> NDArray:
-        """The control of U nearest to that which costs nothing."""
+        """The projection of u* onto U."""
         return self.problem.controls.project(self.problem.rest).double().cpu().numpy()
 
     @property
@@ -101,7 +101,7 @@ class PredictiveControl(Planner):
         return control
 
     def _solve(self, step: int, x0: NDArray, x: NDArray, u: NDArray) -> tuple[NDArray, NDArray]:
-        """The plan from x₀ at a step, from a start; the start itself where the solver left the finite numbers."""
+        """The plan from x₀ at a step, with an initial guess; the guess itself if the solver's result is not finite."""
         inside, end = (np.arange(self.steps) < self.horizon - step).astype(float), step + self.steps
         tail = self._tail.parameters[min(end, self.horizon)]
         given = np.concatenate([x0, inside, [float(end >= self.horizon)], tail])
@@ -132,18 +132,18 @@ class PredictiveControl(Planner):
 
 
 def _later(x: NDArray, u: NDArray) -> tuple[NDArray, NDArray]:
-    """A plan a step later, its end held."""
+    """A plan shifted by one step, with its last entry repeated."""
     return np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
 
 
 def _stacked(x: NDArray, u: NDArray) -> NDArray:
-    """x₀, u₀, x₁, u₁, …, x_H, the order in which fatrop sees the stages."""
+    """x₀, u₀, x₁, u₁, …, x_H, the order of variables in fatrop."""
     return np.concatenate([np.concatenate([x[:-1], u], 1).ravel(), x[-1]])
 
 
 def terminal_cost_of_regulator(problem: Problem) -> TerminalCost:
-    """½ δᵀHδ + pᵀδ with δ = x − x*, LQR's V but for a constant; 0 where it follows a reference, at whose other points a
-    linearisation about one says nothing.
+    """½ δᵀHδ + pᵀδ with δ = x − x*, which is V of LQR up to a constant; 0 for a task with a reference, for which a
+    linearisation at one point is not valid.
     """
     tail, n = riccati(problem), problem.system.n
     x, H, p = casadi.SX.sym("x", n), casadi.SX.sym("H", n, n), casadi.SX.sym("p", n)

@@ -1,4 +1,4 @@
-"""What a planner is, and one in the place of a policy of Stable-Baselines3."""
+"""The interface of planners, and a policy with the interface of Stable-Baselines3 that uses one."""
 
 import time
 from abc import ABC, abstractmethod
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lyapnet.lab.comparison.reference_problems import BoundedProblem
 from lyapnet.lab.comparison.results import ControlTimes
 
-LoopLaw = Callable[[int, NDArray], NDArray]  # (n, x_n) ↦ u_n of one closed loop, whose plan it may remember
+LoopLaw = Callable[[int, NDArray], NDArray]  # (n, x_n) ↦ u_n of one closed loop; it may store a plan
 
 
 class Planner(ABC):
@@ -26,10 +26,10 @@ class Planner(ABC):
 
     @abstractmethod
     def law(self) -> LoopLaw:
-        """The law of one closed loop, from its first step on."""
+        """The law of one new closed loop."""
 
     def count(self, converged: bool) -> None:
-        """Take note of an optimisation."""
+        """Count an optimisation."""
         self.solved, self.unsolved = self.solved + converged, self.unsolved + (not converged)
 
 
@@ -62,7 +62,7 @@ class PlannerPolicy:
 
     @property
     def times(self) -> ControlTimes:
-        """What its calls took so far."""
+        """The durations of its calls so far."""
         first, *later = self.seconds
         return ControlTimes.of(list(chain(*(later or [first]))), first)
 

@@ -1,4 +1,4 @@
-"""The report of a comparison, from whatever results there are: tables, figures, every number, and TensorBoard."""
+"""The report of a comparison from the results that exist: tables, figures, all numbers, and TensorBoard."""
 
 from lyapnet.lab.comparison.report.alternatives import brief_alternatives
 from lyapnet.lab.comparison.report.details import summary

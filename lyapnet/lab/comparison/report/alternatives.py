@@ -1,4 +1,4 @@
-"""What else a user could take: every method on every task, learned or planned, and what it costs and takes."""
+"""The alternatives: every method on every task, learned or planned, with its cost and computation time."""
 
 from dataclasses import replace
 from statistics import fmean
@@ -8,7 +8,7 @@ from lyapnet.base.tables import Column, Table, number, ratio, share
 from lyapnet.lab.comparison.report.names import method_name, name_of
 from lyapnet.lab.comparison.statistics import Comparison, Group, relative_costs
 
-FAILED = 2.0  # times the optimum, above which a closed loop has failed
+FAILED = 2.0  # cost relative to the optimum above which a closed loop counts as failed
 
 
 def alternatives(comparison: Comparison) -> Table:
@@ -25,7 +25,7 @@ def alternatives(comparison: Comparison) -> Table:
 
 
 def brief_alternatives(comparison: Comparison) -> Table:
-    """What of it fits into a terminal."""
+    """The columns that fit into a terminal."""
     full = alternatives(comparison)
     columns = [
         Column("task", ("task",), name_of), Column("method", ("method",), _short_name),

@@ -17,7 +17,7 @@ OVERVIEW = (
 
 
 def tasks_table(comparison: Comparison) -> Table:
-    """What belongs to a task rather than to a method."""
+    """The properties of each task that do not depend on a method."""
     rows = []
     for task in comparison.tasks:
         groups = comparison.of_task(task)
@@ -70,14 +70,14 @@ def details(comparison: Comparison) -> Table:
 
 
 def overview(comparison: Comparison) -> Table:
-    """What of the details is asked first."""
+    """The most important columns of the details."""
     full = details(comparison)
     named = {column.heading: column for column in full.columns}
     return replace(full, title="Cost against the optimum", columns=[named[heading] for heading in OVERVIEW])
 
 
 def summary(comparison: Comparison) -> Table:
-    """What of the details fits into a terminal."""
+    """The columns of the details that fit into a terminal."""
     columns = [
         Column("task", ("task",), name_of), Column("method", ("method",), method_name),
         Column("cost/J*", ("mean", "cost_ratio"), _ratio_or_cost), Column("/ours*", ("at_factor",), factor),
@@ -141,7 +141,7 @@ def _at_fields(at: AtStep | None, baseline: bool) -> dict[str, Any]:
 
 
 def _budget_fields(comparison: Comparison, group: Group) -> dict[str, Any]:
-    """What a baseline was given, in multiples of what ours took in all, and to its convergence."""
+    """The budget of a baseline, relative to ours in total and until convergence."""
     ours, names = comparison.of(group.task, OURS), ("all", "convergence", "seconds")
     if ours is None or group.method == OURS:
         return {f"budget_of_{name}": None for name in names}
@@ -156,7 +156,7 @@ def _budget_fields(comparison: Comparison, group: Group) -> dict[str, Any]:
 
 
 def _at_step(value: float, ended: bool, at: float) -> str:
-    """A relative cost, and where its training ended if that was too soon."""
+    """A relative cost, with the step at which its training ended if it ended before our convergence."""
     return ratio(value) + (f" (ended at {steps(at)})" if ended else "")
 
 
@@ -170,7 +170,7 @@ def _reached_seconds(reached: int, value: float | None) -> str:
 
 
 def _ratio_or_cost(mean: float, relative: float | None) -> str:
-    """A cost where its optimum is not known."""
+    """The cost relative to the optimum; the cost itself if the optimum is not known."""
     return f"J_N {cost(mean)}" if relative is None else ratio(relative)
 
 

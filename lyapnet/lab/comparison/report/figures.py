@@ -29,13 +29,13 @@ from lyapnet.lab.comparison.statistics import (
     spread,
 )
 
-WIDTH = 7.2  # inches: two columns of a paper, where the letters below stay above 7 pt
+WIDTH = 7.2  # inches: two columns of a paper, in which all letters are above 7 pt
 SMALL, LARGE = 7, 8
-LEAST_LOSS, LEAST_GAP = 1e-6, 1e-5  # that are drawn: in cost, and as a share of the optimum
+LEAST_LOSS, LEAST_GAP = 1e-6, 1e-5  # least values in figures: in cost, and relative to the optimum
 
 
 class Look(NamedTuple):
-    """How a method is drawn: without its colour, its dashes and its marker still tell it apart."""
+    """The style of a method's lines; dashes and markers differ too, so that no colour is needed."""
 
     color: str
     dashes: Any  # as matplotlib's linestyle
@@ -99,13 +99,13 @@ def _held(curve: Sequence[tuple[int, float]], steps: np.ndarray) -> np.ndarray:
 
 
 def is_relative(comparison: Comparison) -> bool:
-    """Whether every validation is known against the optimum of its states, which are others for each seed."""
+    """Whether the ratio to the optimum is known for all validations; their states differ between seeds."""
     results = [result for group in comparison.groups.values() for result in group.results]
     return all(point.cost_ratio is not None for result in results for point in result.curve)
 
 
 def caption(name: str, comparison: Comparison) -> str:
-    """What a figure of a report shows, by its name; those of closed loops end with their task."""
+    """The caption of a figure of a report by its name; names of figures of closed loops end with the task."""
     relative = is_relative(comparison)
     words = {"cost": "optimality gap", "gap": GAP} if relative else {"cost": "J_N", "gap": ""}
     kind = next(kind for kind in CAPTIONS if name.startswith(kind))
@@ -134,7 +134,7 @@ def figure3(comparison: Comparison) -> Figure:
 
 
 def _columns(figure: Figure, inches: float) -> int:
-    """How many columns of that width fit."""
+    """The number of columns of a given width that fit."""
     return int(figure.get_size_inches()[0] / inches)
 
 
@@ -164,7 +164,7 @@ def _shown_gap(point: Measurement) -> float | None:
 
 
 def _shown_loss(point: Measurement) -> float | None:
-    """A logarithmic axis has no 0, which a hinge reaches."""
+    """The constraint loss, at least LEAST_LOSS, because it may be 0 and the axis is logarithmic."""
     return None if point.constraint_loss is None else max(point.constraint_loss, LEAST_LOSS)
 
 
@@ -187,7 +187,7 @@ def _draw_band(
 
 
 def look_of(method: str) -> Look:
-    """How a method is drawn, also one that is not known here."""
+    """The style of a method, also of an unknown one."""
     return LOOKS.get(method, Look(CYCLE[sum(map(ord, method)) % len(CYCLE)], (0, (1, 3)), "P"))
 
 
@@ -231,7 +231,7 @@ def _decimal(value: float) -> str:
     return f"$10^{{{exponent}}}$" if digit == 1 else f"${digit}{{\\cdot}}10^{{{exponent}}}$"
 
 
-# What each method ends with
+# Final costs
 
 
 def final(comparison: Comparison) -> Figure:
@@ -276,7 +276,7 @@ def _gap(ratio: float) -> float:
 
 
 def _draw_dot(axes: Axes, x: float, y: float, marker: str, color: str, size: float) -> None:
-    """At its place, or as an arrowhead at the right edge if it diverged."""
+    """Draw a point at its place, or an arrowhead at the right edge if it diverged."""
     if math.isfinite(x):
         axes.plot(x, y, marker, color=color, markersize=size, markeredgewidth=0)
     else:

@@ -1,4 +1,4 @@
-"""What each method costs on the mean under noise, and how much more than the method that costs least."""
+"""The mean cost of each method under noise, and its excess over the method with the least cost."""
 
 from collections.abc import Sequence
 from math import isinf
@@ -21,7 +21,7 @@ def mean_costs(comparison: Comparison) -> Table | None:
 
 
 def _rows(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """Those of one task; none without noise."""
+    """The rows of one task; empty without noise."""
     noisy = [group for group in groups if group.under_noise]
     least = min(noisy, key=lambda group: group.cost.mean, default=None)
     rows = []

@@ -1,4 +1,4 @@
-"""Names of tasks and methods for readers."""
+"""Readable names of tasks and methods."""
 
 from lyapnet.lab.comparison.results import WITH_VALUE
 
@@ -7,12 +7,12 @@ PLANNERS = {"rest": "no control", "lqr": "LQR", "ilqr": "iLQR"}
 
 
 def name_of(task: str) -> str:
-    """A task for readers."""
+    """The readable name of a task."""
     return task.replace("_", " ")
 
 
 def method_name(method: str) -> str:
-    """A method for readers: PPO (tuned), MPC (25 % of T)."""
+    """The readable name of a method, such as PPO (tuned) or MPC (25 % of T)."""
     algorithm, _, setting = method.partition("_")
     if method.startswith(WITH_VALUE):
         return f"MPC ({method.removeprefix(WITH_VALUE)} steps + V)"

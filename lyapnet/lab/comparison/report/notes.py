@@ -1,4 +1,4 @@
-"""What the numbers of a comparison mean, sentence by sentence, below its tables."""
+"""Notes below the tables of a comparison, which explain the numbers."""
 
 NOTES = (
     "Every method is scored by one evaluator on the same evaluation states of X₀, which no training saw, with its "

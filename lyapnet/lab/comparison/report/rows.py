@@ -1,4 +1,4 @@
-"""Every result and every validation of a comparison in a row of its own, and what is still missing."""
+"""Rows of all results and validations of a comparison, and lines for missing results."""
 
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -46,7 +46,7 @@ def missing(comparison: Comparison, planned: Iterable[tuple[str, str, int]] = ()
 
 
 def _lacking(comparison: Comparison, task: str, method: str, jobs: Iterable[tuple[str, str, int]]) -> str | None:
-    """What is not there yet of one method on one task."""
+    """A line for the missing results of one method on one task."""
     wanted, group = {seed for *pair, seed in jobs if pair == [task, method]}, comparison.of(task, method)
     there = wanted & set(group.seeds if group else ())
     if there == wanted:
@@ -63,7 +63,7 @@ def _expected(comparison: Comparison) -> list[tuple[str, str, int]]:
 
 
 def result_rows(comparison: Comparison) -> list[dict[str, Any]]:
-    """A row for each task, method and seed, with everything that the other tables are made of."""
+    """A row for each task, method and seed, with all numbers that the other tables use."""
     groups = [group for task in comparison.tasks for group in comparison.of_task(task)]
     return [_result_row(result) for group in groups for result in group.results]
 

@@ -1,4 +1,4 @@
-"""The paper's Table I, in both forms of the cost, beside the numbers that it prints."""
+"""The paper's Table I in both forms of the cost, measured and as printed."""
 
 from typing import Any, NamedTuple
 
@@ -74,7 +74,7 @@ def _measured_or_printed(mean: float, std: float | None, diverged: int | None, s
 
 
 def _measured(comparison: Comparison, task: str, form: str, setting: str) -> dict[str, Any]:
-    """A row of what was measured."""
+    """A row of measured numbers."""
     ours = comparison.of(task, OURS)
     row = {"form": form, "setting": setting, "task": task, "source": "measured"}
     loss = ours.constraint_loss if ours else None

@@ -1,4 +1,4 @@
-"""What the seeds of a method reach, how sure that is, and how methods compare: pure functions of results."""
+"""Statistics of results: means and intervals over the seeds of a method, and comparisons of methods."""
 
 from lyapnet.lab.comparison.statistics.comparison import TASKS, Comparison, Speedup, compared, in_order
 from lyapnet.lab.comparison.statistics.groups import CONVERGED, NEAR, AtStep, Group, Reach

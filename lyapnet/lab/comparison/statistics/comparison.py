@@ -1,4 +1,4 @@
-"""Every method on every task, and how they compare with ours."""
+"""Every method on every task, compared with ours."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Speedup(NamedTuple):
     """A baseline's seconds to within 10 % of the optimum / ours."""
 
     factor: float
-    at_least: bool  # too few seeds of the baseline ever got there: its true factor is greater
+    at_least: bool  # whether the true factor is larger, because too few seeds of the baseline came so close
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,16 @@ class Comparison:
 
     @property
     def tasks(self) -> list[str]:
-        """The paper's first, in one order."""
+        """The tasks, the paper's first, in a fixed order."""
         return in_order((task for task, _ in self.groups), TASKS)
 
     @property
     def methods(self) -> list[str]:
-        """Ours first."""
+        """The methods, ours first."""
         return in_order((method for _, method in self.groups), METHODS)
 
     def without(self, methods: Sequence[str]) -> "Comparison":
-        """That of all other methods."""
+        """All other methods."""
         return Comparison({key: group for key, group in self.groups.items() if group.method not in methods})
 
     def of(self, task: str, method: str) -> Group | None:
@@ -111,7 +111,7 @@ def compared(results: Iterable[Result]) -> Comparison:
 
 
 def _require_equal_states(results: Sequence[Result]) -> None:
-    """Refuse to compare what was not evaluated alike; equal states have equal optima."""
+    """Check that all results of a task have the same evaluation states, by their optima."""
     first = next((result for result in results if result.optima is not None), results[0])
     for result in results:
         alike = len(result.costs) == len(result.sums) == len(first.costs)

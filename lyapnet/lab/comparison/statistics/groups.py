@@ -1,4 +1,4 @@
-"""The seeds of one method on one task: what they cost, and when they came how close to the optimum."""
+"""The seeds of one method on one task: their costs, and the steps at which they came close to the optimum."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -26,7 +26,7 @@ NEAR, CONVERGED = 1.1, 1.02  # cost / optimum: where speeds are compared, and wh
 
 
 class Reach(NamedTuple):
-    """When the seeds first came within a ratio of the optimum.
+    """The steps and seconds at which the seeds first came within a ratio of the optimum.
 
     Medians are over all the seeds, one that never got there being later than any other: they are known where more than
     half of the seeds got there, and None otherwise.
@@ -68,7 +68,7 @@ class Group:
 
     @property
     def seeds(self) -> list[int]:
-        """Those that finished."""
+        """The seeds with a result."""
         return [result.seed for result in self.results]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What one result says: how its costs compare with the optimum, and when its training came how close."""
+"""Statistics of one result: its costs relative to the optimum, and when its training came close to it."""
 
 import torch
 from torch import Tensor
@@ -47,7 +47,7 @@ def best_until(result: Result, steps: float, *, and_next: bool = False) -> float
 
 
 def best_validation(result: Result) -> Measurement:
-    """That of least cost, the later of two: whose checkpoint a baseline is evaluated with."""
+    """The validation with the least cost, the later of two; a baseline is evaluated with its checkpoint."""
     return min(reversed(result.curve), key=lambda one: one.cost)
 
 

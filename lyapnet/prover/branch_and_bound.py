@@ -4,6 +4,7 @@ Both answers follow from rigorous bounds (lyapnet.prover.taylor); values at poin
 question, up to which level of W a condition holds, is in lyapnet.prover.proof.
 """
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -88,13 +89,13 @@ Sublevel sets {W ≤ ρ} are closed, so ρ must be strictly below the least W of
 
 
 def just_below(value: float) -> float:
-    """The number, lowered by MARGIN."""
-    return value - MARGIN * abs(value)
+    """The number, lowered by MARGIN; an infinite one stays."""
+    return value - MARGIN * abs(value) if math.isfinite(value) else value
 
 
 def just_above(value: float) -> float:
-    """The number, raised by MARGIN."""
-    return value + MARGIN * abs(value)
+    """The number, raised by MARGIN; an infinite one stays."""
+    return value + MARGIN * abs(value) if math.isfinite(value) else value
 
 
 class Question(ABC):

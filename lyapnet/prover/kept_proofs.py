@@ -25,11 +25,12 @@ from typing import Any, NamedTuple
 
 import torch
 
+from lyapnet.base import linear_algebra
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file, write_atomically
 from lyapnet.base.plain_data import plain_data_of
 from lyapnet.base.types import Corner
-from lyapnet.graphs import tracing
+from lyapnet.graphs import c_functions, operators, tracing
 from lyapnet.graphs.compilation import FLAGS
 from lyapnet.prover.bounds import Bounds
 from lyapnet.prover.boxes import CutTree
@@ -44,16 +45,19 @@ SOURCES = (Path(__file__).parent,)
 """The folder whose code a proof depends on: the search, the bounds and their kernel.
 
 f, g, ℓ, V, u and the code that assembles c from them are not in it: the fingerprint of the traced function contains all
-their operations and numbers. hash_of_sources adds the file of the tracing, which merges equal operations, and those of
-costs and sets of controls, whose minimum is a single operation in a trace.
+their operations and numbers. hash_of_sources adds SINGLE_FILES.
+"""
+SINGLE_FILES = (tracing, operators, c_functions, linear_algebra, ball, sets, control_costs, minimum)
+"""The other modules that bounds use: of the tracing, which merges equal operations, of operators and exported programs,
+and of costs and sets of controls, whose minimum is a single operation in a trace.
 """
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     """A hash of the code in the folders and of the tracing, compiler flags, torch's version and users' operators."""
     found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
-    for file in (tracing.__file__, ball.__file__, control_costs.__file__, minimum.__file__, sets.__file__):
-        found.update(Path(str(file)).read_bytes())
+    for module in SINGLE_FILES:
+        found.update(Path(str(module.__file__)).read_bytes())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):
             content = path.read_bytes()

@@ -146,6 +146,14 @@ def test_a_changed_byte_in_any_of_them_is_another_key(tmp_path):
     assert kept_proofs.hash_of_sources(folders) != key
 
 
+@pytest.mark.parametrize("module", kept_proofs.SINGLE_FILES, ids=lambda module: module.__name__)
+def test_a_changed_byte_in_a_single_file_is_another_key(module, tmp_path, monkeypatch):
+    key, changed = kept_proofs.hash_of_sources(), tmp_path / "changed.py"
+    changed.write_bytes(Path(module.__file__).read_bytes() + b"#")
+    monkeypatch.setattr(module, "__file__", str(changed))
+    assert kept_proofs.hash_of_sources() != key
+
+
 def test_proofs_of_other_compiler_flags_have_another_key(monkeypatch):
     key = kept_proofs.hash_of_sources()
     monkeypatch.setattr(kept_proofs, "FLAGS", (*kept_proofs.FLAGS, "-ffast-math"))
@@ -384,3 +392,9 @@ def test_violations_are_the_worst_points_found(P, monkeypatch):
     low = float(condition.height(condition.point[0], condition.point[1:])) * 0.2
     assert len(violations(condition, domain(), low, 40, torch.Generator().manual_seed(0))) == 0
     assert len(violations(DecreaseCondition(loop(P), 0.9, 0.05), domain(), math.inf, 40)) == 0
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf])
+def test_the_margin_of_a_level_leaves_infinite_ones(value):
+    assert branch_and_bound.just_below(value) == branch_and_bound.just_above(value) == value
+    assert branch_and_bound.just_below(-2.0) < -2.0 < branch_and_bound.just_above(-2.0)

@@ -307,7 +307,7 @@ def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
         raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
     holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}
     bounds = {symbol: bound for symbol, bound in rule["bounds"].items() if bound is not None}
-    if bounds and value == []:
+    if bounds and isinstance(value, list) and not value:  # == is elementwise for a number of NumPy
         raise UsageError(f"Expected {key} with at least one entry, got none; correct it: {rule['doc']}")
     for symbol, bound in bounds.items():
         for number in value if isinstance(value, list) else [value]:

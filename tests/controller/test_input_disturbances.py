@@ -148,3 +148,10 @@ def test_more_disturbances_than_readings_are_refused():
     outputs = {"measure": ["x"], "noise": 0.01, "input_disturbances": dict.fromkeys(names, 0.1)}
     with pytest.raises(UsageError, match=r"at most as many .* as readings, 1, got 2"):
         build_problem(config_from_plain({**quadrotor, "outputs": outputs}))
+
+
+def test_a_drift_may_be_a_number_of_numpy():
+    loop = controller_of(**TASK).with_estimator(input_disturbances={"force": np.float64(SIGMA)})
+    assert loop.d_hat.shape == (1,)
+    with pytest.raises(UsageError, match="input_disturbances"):
+        controller_of(**TASK).with_estimator(input_disturbances={"force": np.float64(0)})

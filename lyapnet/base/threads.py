@@ -48,7 +48,7 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
 
 def size_of_parts(rows: int, least: int) -> int:
     """The smallest size, of at least a number of rows, in which all parts of a batch are equally large."""
-    return next(size for size in range(min(least, rows), rows + 1) if not rows % size)
+    return next((size for size in range(min(least, rows), rows) if not rows % max(size, 1)), rows)
 
 
 def seconds_of_work() -> float:

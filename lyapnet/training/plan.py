@@ -209,6 +209,8 @@ def _require_own_classes(given: Config, parts: Parts, config: Config, checkpoint
 
 def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:
     changed = [key for key in differing_keys(config, stored) if not key.startswith(CHANGEABLE_ON_RESUME)]
+    if {config.training.threads, stored.training.threads} == {None, 1}:  # torch computes on one thread in both
+        changed.remove("training.threads")
     if [*config.family] != [*stored.family]:
         changed = changed or ["order in family"]
     if changed:

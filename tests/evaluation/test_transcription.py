@@ -1,6 +1,7 @@
 """The optimum by direct transcription, held against Riccati, rollouts and finite differences; and what it refuses."""
 
 import math
+import random
 from collections import Counter
 from pathlib import Path
 
@@ -386,6 +387,31 @@ def test_damaged_files_are_solved_again(solved, damage):
     assert [oracle.cache.read(x) for x in x0] == [None] * 3
     assert_close(oracle.solve(x0).cost, optima.cost)
     assert torch.equal(unsolvable(oracle).solve(x0).cost, optima.cost)
+
+
+def test_a_flipped_bit_is_no_controls_or_the_same(solved):
+    oracle, x0, _ = solved
+    path, kept = oracle.cache._file(x0[0]), oracle.cache.read(x0[0])
+    content, draws = path.read_bytes(), random.Random(0)
+    for _ in range(2000):
+        flipped = bytearray(content)
+        flipped[draws.randrange(len(content))] ^= 1 << draws.randrange(8)
+        path.write_bytes(flipped)
+        found = oracle.cache.read(x0[0])
+        assert found is None or torch.equal(found, kept)
+    path.write_bytes(content)
+
+
+def test_a_write_that_fails_leaves_no_draft(solved, monkeypatch):
+    oracle, x0, _ = solved
+    files = {*oracle.cache.folder.iterdir()}
+
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    oracle.cache.write(x0[0], oracle.cache.read(x0[0]))
+    assert {*oracle.cache.folder.iterdir()} == files
 
 
 def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path, monkeypatch):

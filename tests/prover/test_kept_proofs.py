@@ -296,7 +296,6 @@ def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
     assert (again.verdict, again.level) == ("falsified", pytest.approx(whole.level, rel=0.05))
 
 
-@pytest.mark.gate
 def test_a_file_that_says_finished_is_bounded_again(P, kept):
     """All waiting leaves are listed as closed, as if the proof were finished."""
     rewritten(kept, called_closed)
@@ -309,7 +308,6 @@ def test_a_file_that_says_finished_is_bounded_again(P, kept):
 # Checking without a search
 
 
-@pytest.mark.gate
 def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
     """With K cuts, the search bounds 2K + 1 boxes, and the check bounds the K + 1 leaves."""
     content = read(finished)

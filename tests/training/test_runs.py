@@ -1,5 +1,6 @@
 """Training as a user meets it: killed, interrupted, resumed, fine-tuned, failed, and what it shows meanwhile."""
 
+import contextlib
 import csv
 import ctypes
 import errno
@@ -39,7 +40,7 @@ from lyapnet.experiment.assembly import build_problem, build_value_function
 from lyapnet.experiment.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.experiment.config import config_from_plain, load_config
 from lyapnet.task.systems import DoubleIntegrator
-from lyapnet.training import loggers, metrics_file
+from lyapnet.training import loggers, metrics_file, plan
 from lyapnet.training.plan import plan_run
 from lyapnet.training.run_lock import RunLock
 from lyapnet.training.runs import new_run
@@ -433,6 +434,7 @@ def ask(capsys, monkeypatch):
         ("system.parameters.mass=2", "system.parameters.mass"),
         ("training.learning_rate=0.1", "training.learning_rate"),
         ("network.hidden=[8, 9]", "network.hidden"),
+        ("training.threads=2", "training.threads"),  # of torch, whose sums depend on their number
     ],
 )
 def test_resuming_another_config_is_refused(override, key, reference, ask):
@@ -441,6 +443,16 @@ def test_resuming_another_config_is_refused(override, key, reference, ask):
     assert message.count("\n") == 1
     for text in ("Expected", key, "--finetune"):
         assert text in message
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "same"), [(1, None, True), (None, 1, True), (None, None, True), (2, None, False)]
+)
+def test_a_run_of_one_thread_goes_on_with_programs_on_all_cores(then, now, same):
+    task = str(ROOT / "conf" / "double_integrator.yaml")
+    stored, given = (load_config(task, [f"training.threads={threads or 'null'}"]) for threads in (then, now))
+    with contextlib.nullcontext() if same else pytest.raises(UsageError, match=r"got another training\.threads"):
+        plan._require_same_experiment(given, stored, Path("last.ckpt"))
 
 
 def test_resuming_another_config_is_refused_before_the_first_checkpoint_too(desk):

@@ -3,7 +3,8 @@
 import contextlib
 import hashlib
 import io
-import tempfile
+import os
+import secrets
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +40,7 @@ class OptimaCache:
             # the archive's checksums detect damaged files
             with np.load(io.BytesIO(self._file(x0).read_bytes()), allow_pickle=False) as entries:
                 u = torch.from_numpy(entries["u"])
-        except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile):
+        except (OSError, EOFError, KeyError, ValueError, TypeError, RuntimeError, zipfile.BadZipFile):
             return None
         fits = u.dtype == torch.float64 and u.shape == self.shape and bool(torch.isfinite(u).all())
         return u if fits else None
@@ -50,9 +51,12 @@ class OptimaCache:
         np.savez(content, u=u.numpy())
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".new_", delete=False) as draft:
-                draft.write(content.getvalue())
-            Path(draft.name).replace(self._file(x0))
+            draft = self.folder / f".new_{os.getpid()}_{secrets.token_hex(8)}"
+            try:
+                draft.write_bytes(content.getvalue())
+                draft.replace(self._file(x0))
+            finally:
+                draft.unlink(missing_ok=True)
 
     def _file(self, x0: Tensor) -> Path:
         return self.folder / f"{_hash(x0.numpy().tobytes())}.npz"

@@ -14,7 +14,7 @@ Part = TypeVar("Part")
 Result = TypeVar("Result")
 CORES = torch.get_num_threads()  # before any choice: those of the machine, or OMP_NUM_THREADS
 _this = threading.local()  # of each thread: is_worker, and waited, the seconds for which it waited for its workers
-_of_programs: list[int] = []  # threads of compiled programs, if they are not those of torch
+_of_programs: int | None = None  # threads of compiled programs; None: as many as torch has
 
 
 def use_threads(count: int | None) -> None:
@@ -22,8 +22,9 @@ def use_threads(count: int | None) -> None:
 
     In small networks more threads of torch mostly wait for each other; compiled programs do not.
     """
+    global _of_programs
     torch.set_num_threads(count or 1)
-    _of_programs[:] = [CORES] if count is None else []
+    _of_programs = CORES if count is None else None
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
@@ -32,7 +33,7 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
     It pays for compiled programs, which release Python's lock. A function that divides its own part again runs on the
     thread that it has.
     """
-    count = min(*(_of_programs or [torch.get_num_threads()]), len(parts))
+    count = min(_of_programs or torch.get_num_threads(), len(parts))
     if count < 2 or getattr(_this, "is_worker", False):
         return [function(part) for part in parts]
 
@@ -48,7 +49,7 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
 
 def size_of_parts(rows: int, least: int) -> int:
     """The smallest size, of at least a number of rows, in which all parts of a batch are equally large."""
-    return next((size for size in range(min(least, rows), rows) if not rows % max(size, 1)), rows)
+    return next((size for size in range(min(least, rows), rows) if not rows % size), rows)
 
 
 def seconds_of_work() -> float:

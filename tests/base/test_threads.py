@@ -13,7 +13,7 @@ from lyapnet.base.threads import in_threads, seconds_of_work, size_of_parts, use
 @pytest.fixture
 def threads(monkeypatch):
     """Sets the number of threads that torch says it has."""
-    monkeypatch.setattr(module, "_of_programs", [])
+    monkeypatch.setattr(module, "_of_programs", None)
     return lambda count: monkeypatch.setattr(torch, "get_num_threads", lambda: count)
 
 
@@ -74,7 +74,7 @@ def test_parts_are_equally_large():
 @pytest.mark.parametrize(("count", "of_torch", "of_programs"), [(None, 1, 3), (1, 1, 1), (2, 2, 2)])
 def test_by_default_programs_have_all_cores_and_torch_one(count, of_torch, of_programs, monkeypatch):
     monkeypatch.setattr(module, "CORES", 3)
-    monkeypatch.setattr(module, "_of_programs", [])
+    monkeypatch.setattr(module, "_of_programs", None)
     before = torch.get_num_threads()
     try:
         use_threads(count)

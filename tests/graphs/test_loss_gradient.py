@@ -80,7 +80,7 @@ def test_parts_of_a_batch_give_the_same_gradient_on_any_number_of_threads(monkey
     sizes, run = set(), KERNEL.__call__
     monkeypatch.setattr(KERNEL, "__call__", lambda *given: sizes.add(len(given[-1])) or run(*given))
     for threads in (1, 2):
-        monkeypatch.setattr("lyapnet.base.threads._of_programs", [threads])
+        monkeypatch.setattr("lyapnet.base.threads._of_programs", threads)
         differentiate(*columns)
         found.append(slopes(loss))
         assert_close(slopes(loss), [*by_torch(loss, columns)], rtol=1e-12, atol=1e-14)

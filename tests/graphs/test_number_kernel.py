@@ -289,7 +289,7 @@ def test_kernels_may_run_in_several_threads():
 
 
 def test_parts_run_at_once_on_as_many_threads_as_torch_has(monkeypatch):
-    monkeypatch.setattr("lyapnet.base.threads._of_programs", [3])
+    monkeypatch.setattr("lyapnet.base.threads._of_programs", 3)
     at_once = Barrier(3, timeout=60)
 
     def run(k):

@@ -339,7 +339,7 @@ def test_a_compiled_batch_in_parts_has_the_same_gradient_on_any_number_of_thread
     monkeypatch.setattr(ScanKernel, "__call__", lambda *a: sizes.add(len(a[-1])) or integrate(*a))
     found = []
     for threads in (1, 2):
-        monkeypatch.setattr("lyapnet.base.threads._of_programs", [threads])
+        monkeypatch.setattr("lyapnet.base.threads._of_programs", threads)
         is_exact(rollouts, x0)
         found.append([*slopes(rollouts[0], x0), rollouts[0](x0).cost.detach()])
     assert sizes == {16}

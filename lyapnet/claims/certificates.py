@@ -105,7 +105,8 @@ class Certificate(ABC):
             at: NAME=VALUE for each parameter, if the certificate is about one member of a family.
             user: `system`, `network` and so on, if the user wrote them.
         """
-        given = {name: value for name, value in {**self.options, **user}.items() if value is not None}
+        written = {**self.options, **user}
+        given = {name: value for name, value in written.items() if value is not None and value is not False}
         pairs = [
             (name, one) for name, value in given.items() for one in (value if isinstance(value, list) else [value])
         ]

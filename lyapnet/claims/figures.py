@@ -168,7 +168,8 @@ def region(
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
             handles.setdefault("closed loops", line)
     legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
-    what = "region of attraction" if claim.disturbance is None else "region under disturbances"
+    what = "invariant region" if claim.is_practical else "region of attraction"
+    what += "" if claim.disturbance is None else " under disturbances"
     what += "" if claim.plants is None else " of each plant"
     share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the {what}"
     proved = claim.rho > -float("inf")
@@ -197,10 +198,10 @@ def _draw_over_state(
 
 
 def _levels_of_region(claim: ProvedRegion) -> list["Level"]:
-    """The levels to draw: ρ; c, if there is a disturbance; and the level for all of X₀, if it is higher than ρ."""
-    name = "V(0, x) ≤ ρ: never left" + (", and attracted" if claim.disturbance is None else "")
+    """The levels to draw: ρ; c of a practical claim; and the level for all of X₀, if it is higher than ρ."""
+    name = "V(0, x) ≤ ρ: never left" + ("" if claim.is_practical else ", and attracted")
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
-    if proved and claim.disturbance is not None:
+    if proved and claim.is_practical:
         proved += [Level(0.0, claim.hole, ORANGE, "V(0, x) ≤ c: entered, then never left", proved=True)]
     wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
     return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])

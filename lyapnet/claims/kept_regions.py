@@ -26,10 +26,11 @@ class KeptRegion(NamedTuple):
     decay: float  # λ in 1/s
     states: Box  # D; of width 0 along ignorable states
     parameters: dict[str, list[float]]  # the bounds of P by name; empty for one plant
-    contracting: tuple[Box, Tensor] | None  # (B, Y); None with a disturbance or readings
+    contracting: tuple[Box, Tensor] | None  # (B, Y); None for a claim of practical stability
     disturbance: State | None  # w
     readings: Readings | None  # when u is read; None: at every t
     steps: dict[str, Any] | None  # Δt and method of the steps; None: continuous time
+    practical: bool  # whether practical stability is claimed without a disturbance and readings
     hole: float  # c
     wanted: float  # the level up to which the proof searched
     rho: float  # the proved level, as recorded
@@ -43,8 +44,9 @@ class KeptRegion(NamedTuple):
         parameters: Sequence[str],
         readings: Readings | None,
         steps: dict[str, Any] | None,
+        practical: bool,
     ) -> None:
-        """Refuse λ, w, readings, steps or names of parameters that differ from those of the file.
+        """Refuse λ, w, readings, steps, what is claimed or names of parameters that differ from those of the file.
 
         Args:
             disturbance: w of n states, followed by zeros for parameters.
@@ -61,6 +63,11 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the readings of {str(self.path)!r}, got others; {NEW_FILE}.")
         if self.steps != steps:
             raise UsageError(f"Expected the steps of {str(self.path)!r}, or none, got others; {NEW_FILE}.")
+        if self.practical != practical:
+            ends = ("convergence", "practical stability")
+            raise UsageError(
+                f"Expected {ends[self.practical]} as in {str(self.path)!r}, got {ends[practical]}; {NEW_FILE}."
+            )
 
     def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
         """Refuse D or P that differ from those of the file.
@@ -116,14 +123,19 @@ def kept_region(path: Path) -> KeptRegion:
             w = torch.tensor(of["disturbance"], dtype=torch.float64)[:n]
             if not bool((w > 0).any()):
                 raise ValueError("a disturbance of zeros")
-        if "disturbance" not in of and readings is None:
+        practical = of.get("practical", False)
+        if not isinstance(practical, bool) or (practical and ("disturbance" in of or readings is not None)):
+            raise ValueError("practical stability twice")
+        if "disturbance" not in of and readings is None and not practical:
             lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
             contracting = Box(lowest, highest), Y
         D = Box(lower[1 : 1 + n], upper[1 : 1 + n])
         steps = of.get("steps")
         if steps is not None:
             steps = {"dt": float(steps["dt"]), "method": str(steps["method"])}
-        return KeptRegion(path, decay, D, ranges, contracting, w, readings, steps, hole, wanted, rho, seconds)
+        return KeptRegion(
+            path, decay, D, ranges, contracting, w, readings, steps, practical, hole, wanted, rho, seconds
+        )  # fmt: skip
 
 
 def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:

@@ -254,8 +254,9 @@ class Reach(Claim):
 class Region(ReadAtTimes):
     """A region of attraction of the receding law u(0, x), for all times: proved.
 
-    With a disturbance, it is a set that no closed loop leaves, and a smaller set that each closed loop enters and never
-    leaves. With parameters, it holds for every plant whose constant parameters lie in the given intervals.
+    With a disturbance, and if it is `practical`, it is a set that no closed loop leaves, and a smaller set that each
+    closed loop enters and never leaves. With parameters, it holds for every plant whose constant parameters lie in the
+    given intervals.
     Without `time` it is about steps if V was trained for these and no option is about continuous time; otherwise u is
     read at every t.
     lyapnet.claims.region.ProvedRegion states the conditions.
@@ -271,6 +272,9 @@ class Region(ReadAtTimes):
     parameters: Mapping[str, Sequence[float]] | None = option(
         None, "A parameter of the plant that may lie anywhere between; u and V stay. May be given again.",
         flag="parameter", metavar="NAME=LOWER:UPPER", check=check_parameters,
+    )  # fmt: skip
+    practical: bool = option(
+        False, "Claim that closed loops enter a set {V ≤ c} and stay in it, not that they converge."
     )  # fmt: skip
 
     def require_law(self, controller: "Controller") -> None:
@@ -290,7 +294,7 @@ class Region(ReadAtTimes):
             controller.closed_loop, controller.problem, self.decay, box_of(self.states), run.budget, run.generator,
             run.report, run.keep, disturbance=disturbance_of(self.disturbance, controller),
             plants=plants_of(controller, self.parameters) if self.parameters else None,
-            readings=readings_of(self, controller, "continuous", forever=True), steps=steps,
+            readings=readings_of(self, controller, "continuous", forever=True), steps=steps, practical=self.practical,
         )  # fmt: skip
         return RegionCertificate(controller, found, run.options(self))
 

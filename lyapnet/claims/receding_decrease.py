@@ -30,6 +30,7 @@ class RecedingDecrease(DecreaseCondition):
     Args:
         parameters: names of the constants of the system, on which neither V nor u depends.
         readings: when u(0, x) is read and then held; None: it is read at every t.
+        practical: whether the hole is all of {V < c}, though there are no disturbance and no readings.
     """
 
     proves, partial = "region", True
@@ -41,11 +42,18 @@ class RecedingDecrease(DecreaseCondition):
         disturbance: State | None = None,
         parameters: Sequence[str] = (),
         readings: Readings | None = None,
+        practical: bool = False,
     ):
         super().__init__(closed_loop, 1.0, 0.0, disturbance=disturbance, readings=readings)
         if not 0 < decay < math.inf:
             raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
         self.decay, self.hole, self.around, self.parameter_names = decay, 0.0, None, list(parameters)
+        self.practical = practical
+
+    @property
+    def is_practical(self) -> bool:
+        """Whether the hole is all of {V < c}, and not a set on which the law contracts."""
+        return self.practical or self.disturbance is not None or self.readings is not None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -53,8 +61,10 @@ class RecedingDecrease(DecreaseCondition):
         hole = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
         disturbance = {} if w is None else {"disturbance": w.tolist()}
         parameters = {"parameters": self.parameter_names} if self.parameter_names else {}
+        practical = {"practical": True} if self.practical else {}
         return {
-            "decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters, **self.facts_of_readings
+            "decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters, **practical,
+            **self.facts_of_readings,
         }  # fmt: skip
 
     def open_hole(
@@ -80,19 +90,24 @@ class RecedingDecrease(DecreaseCondition):
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
         if proposed is not None and not self.hole < rim:
             raise UsageError(f"Expected V > c = {self.hole!r} around the hole, got V ≥ {rim:g}; {REMEDY}.")
-        self.constraints = self._hole_of(around.box)
+        self.constraints = self.outside_hole(around.box)
 
     def _around_hole(self, inner: Box, states: Box, seen: Sequence[int]) -> tuple[Corners, Corners]:
         """Boxes of (0, x) on which V > c is required: the boundary of B; `inner` is B with the bounds of constants."""
         return faces(*over_time(inner, 0.0), [1 + i for i in seen])
 
-    def _hole_of(self, box: Box) -> Constraints:
-        """Constraints h ≤ 0 that exclude the hole in a box B."""
+    def outside_hole(self, box: Box | None) -> Constraints:
+        """Constraints h ≤ 0 that exclude the hole in a box B, or in D if there is none."""
         return OutsideTheHole(self.V, box, self.hole)
 
     def open_everywhere(self, level: float) -> None:
-        """Exclude {x ∈ D: V < c} with c = level from the condition; disturbances or a held u may increase V there."""
-        self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
+        """Exclude {x ∈ D: V < c} with c = level from the condition; V may rise there."""
+        self.hole = level
+        self.constraints = self.outside_hole(None)
+
+    def level_reached(self, t: Time, x: State) -> PerState:
+        """The level c up to which the hole has to reach if V does not fall at a state: V(x)."""
+        return self.V(t, x)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         return self.parts_under(t, x, self.closed_loop.policy(t, x))

@@ -76,6 +76,9 @@ class ProvedRegion:
     V(x̂) ≤ ρ, at all times at which it may be in use (see Readings). Near the goal V need not fall under a held control,
     so the hole and the conclusions are those with a disturbance, which may be 0.
 
+    A `practical` claim has these conclusions without a disturbance and with u read at every t, for a law that does not
+    contract around the goal, or where this is not to be proved.
+
     With steps, the claim is about x_{k+1} = F(x_k), one step of the horizon's method with u(0, x_k) held, and not about
     the time between the steps. At each x ∈ D with V(x) ≤ ρ
 
@@ -84,7 +87,8 @@ class ProvedRegion:
     V > ρ wherever some constraint has h_j ≥ 0, V > c on D without B, and F contracts on B. {V ≤ ρ} may touch the
     boundary of D. By induction V(x_k) ≤ max((1 − λΔt)^k V(x_0), c): no sequence of steps that starts in {x ∈ D: V ≤ ρ}
     leaves it, and each enters the closed set {x ∈ D: V ≤ c} ⊂ B and stays there. In this set all sequences converge to
-    one fixed point of F by Banach's theorem, at the rate 1 − κΔt.
+    one fixed point of F by Banach's theorem, at the rate 1 − κΔt. A practical claim about steps needs no B, and says no
+    more than that each sequence enters {x ∈ D: V ≤ c} and stays there.
 
     With plants, all of this holds for ẋ = F(x; p) with every constant p in a box P, where u and V depend on x alone.
     The region is the same for all p; each p has its own equilibrium, in the hole.
@@ -105,8 +109,8 @@ class ProvedRegion:
     wanted: float  # an upper bound of max V on X₀, at most 0.1 % above it
     least: float  # the largest V among samples of X₀
     hole: float  # c; 0 without a hole
-    contraction: Contraction | None  # None if none is proved, and with a disturbance
-    slowest: float  # as contraction_around gives it, in 1/s; nan with a disturbance
+    contraction: Contraction | None  # None if none is proved, and for a practical claim
+    slowest: float  # as contraction_around gives it, in 1/s; nan for a practical claim
     volume_share: float  # a lower bound of the share of X₀ in the region
     region_share: float  # a lower bound of the share of D in the region
     proof: Proof | None  # of the inequality for V̇; None without a hole
@@ -114,7 +118,7 @@ class ProvedRegion:
     left_out: list[int]  # ignorable states
     constraints: Sequence[str] = ()
     disturbance: State | None = None  # w in units of ẋ, (n,); None without a disturbance
-    extent: Box | None = None  # a box around {x ∈ D: V(x) ≤ c}, with a disturbance and a proved region
+    extent: Box | None = None  # a box around {x ∈ D: V(x) ≤ c}, for a practical claim and a proved region
     ultimate_share: float = math.nan  # an upper bound of the share of D in {x ∈ D: V(x) ≤ c}
     plants: Plants | None = None  # None for a claim about one plant
     set_up: float = 0.0  # seconds of the budget before the first box
@@ -122,18 +126,23 @@ class ProvedRegion:
     distance_left: float = math.nan  # a bound of the distance from the goal as t → ∞, if u is rounded
     readings: Readings | None = None  # when u is read; None: at every t
     steps: Horizon | None = None  # Δt and method of the steps; None: continuous time
+    practical: bool = False  # whether practical stability is claimed without a disturbance and readings
 
     @property
     def is_practical(self) -> bool:
         """Whether the claim is practical stability: closed loops enter {V ≤ c}, and stay there."""
-        return self.disturbance is not None or self.readings is not None
+        return self.practical or self.disturbance is not None or self.readings is not None
 
     @property
     def entered_within(self) -> float:
-        """An upper bound of the time in s until V ≤ c on each closed loop of the region; ∞ without a region."""
+        """An upper bound of the time in s until V ≤ c on each closed loop of the region; ∞ without a region.
+
+        Of steps, (1 − λΔt)^k ≤ e^(−λkΔt) ≤ c/ρ for the first k with kΔt ≥ ln(ρ/c)/λ.
+        """
         if not self.rho >= self.hole > 0:
             return math.inf
-        return just_above(math.log(self.rho / self.hole) / self.decay)
+        within = math.log(self.rho / self.hole) / self.decay
+        return just_above(within if self.steps is None else within + self.steps.dt)
 
     @property
     def counterexample(self) -> Counterexample | None:
@@ -176,8 +185,8 @@ class ProvedRegion:
         """The reason why there is no hole; None if there is one."""
         if self.is_practical:
             return None if self.hole > 0 else (
-                f"no levels c < ρ were found between which V(0, ·) falls under every {self._cause}: choose a smaller "
-                f"one, or a smaller decay{self._parameter_advice}"
+                f"no levels c < ρ were found between which V(0, ·) falls{self._under_cause}: choose "
+                f"{self._smaller}a smaller decay{self._parameter_advice}"
             )  # fmt: skip
         plants = "" if self.plants is None else " of all plants"
         if self.contraction is None and not self.slowest < 0:
@@ -190,8 +199,8 @@ class ProvedRegion:
             )
         if self.contraction is None:
             return (
-                f"no box around the goal was found in time on which u(0, x){plants} is proved to contract"
-                f"{self._parameter_advice}"
+                f"no box around the goal was found in time on which u(0, x){plants} is proved to contract: claim "
+                f"practical stability alone (--practical){self._parameter_advice}"
             )
         if not self.hole > 0:
             return "V(0, ·) is not positive around the goal, or this was not proved in time"
@@ -202,8 +211,8 @@ class ProvedRegion:
         """The reason why the region does not contain X₀."""
         if self.verdict == "falsified" and self.is_practical:
             return (
-                f"V(0, ·) does not fall at the rate λ there, at a level above c, under the worst {self._cause}: "
-                f"choose a smaller one, or a smaller decay{self._parameter_advice}"
+                f"V(0, ·) does not fall at the rate λ there, at a level above c{self._under_cause}: choose "
+                f"{self._smaller}a smaller decay{self._parameter_advice}"
             )
         if self.verdict == "falsified":
             leaves = "" if self.steps is None else ", or the step from there leaves D (then choose a larger set)"
@@ -220,9 +229,16 @@ class ProvedRegion:
         return "V(0, ·) does not fall close to the level that X₀ needs"
 
     @property
-    def _cause(self) -> str:
-        """The assumption that makes V rise, for advice to reduce it."""
-        return "disturbance" if self.readings is None else "age and error of a reading"
+    def _under_cause(self) -> str:
+        """What makes V rise, in words; empty without a disturbance and readings."""
+        if self.readings is not None:
+            return " under every age and error of a reading"
+        return "" if self.disturbance is None else " under every disturbance"
+
+    @property
+    def _smaller(self) -> str:
+        """Advice to reduce what makes V rise."""
+        return "a smaller one, or " if self._under_cause else ""
 
     @property
     def _parameter_advice(self) -> str:
@@ -251,7 +267,7 @@ def _read_kept(file: Path | None, condition: RecedingDecrease, n: int) -> KeptRe
     kept = kept_region(file)
     kept.require(
         condition.decay, condition.disturbance, n, condition.parameter_names, condition.readings,
-        condition.facts.get("steps"),
+        condition.facts.get("steps"), condition.practical,
     )  # fmt: skip
     return kept
 
@@ -270,6 +286,7 @@ def prove_region(
     plants: Plants | None = None,
     readings: Readings | None = None,
     steps: bool = False,
+    practical: bool = False,
 ) -> ProvedRegion:
     """Prove the largest sublevel set of V(0, ·) that a budget allows as a region of attraction of the receding law.
 
@@ -283,6 +300,8 @@ def prove_region(
         plants: the claim is about each of these plants under the law and V of the nominal plant.
         readings: when u is read; None: at every t.
         steps: whether the claim is about the steps of the horizon's method, without disturbance and readings.
+        practical: whether to claim that closed loops enter {V ≤ c} and stay there, and not that they converge; a claim
+            with a disturbance or readings says no more anyway.
 
     Raises:
         UsageError: λ, w or D are unsuitable, the system is a family, an operator has no bound, or the file has another
@@ -299,10 +318,12 @@ def prove_region(
         loop, problem = plants.all_of(loop, problem)
         states, w = states and plants.around(states), None if w is None else plants.disturbance_of_all(w)
         readings = readings and plants.readings_of_all(readings)
-    practical, stepped = w is not None or readings is not None, problem if steps else None
+    stepped = problem if steps else None
+    practical = practical and w is None and readings is None
     condition = (
-        SteppedDecrease(loop, decay, problem, names) if steps else RecedingDecrease(loop, decay, w, names, readings)
-    )
+        SteppedDecrease(loop, decay, problem, names, practical) if steps
+        else RecedingDecrease(loop, decay, w, names, readings, practical)
+    )  # fmt: skip
     goal, kept = problem.goal.double(), _read_kept(keep, condition, n)
     setting = find_setting(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
@@ -320,7 +341,9 @@ def prove_region(
         options = {"generator": generator, "report": report, "keep": keep, "replay": replay}
         proof = prove_in_time(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
-    extent, ultimate = (None, math.nan) if not practical or rho == -math.inf else _ultimate_set(condition, D, n, budget)
+    extent, ultimate = None, math.nan
+    if condition.is_practical and rho > -math.inf:
+        extent, ultimate = _ultimate_set(condition, D, n, budget)
     precision, distance = _rounding_effect(
         loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen, stepped
     )  # fmt: skip
@@ -333,6 +356,7 @@ def prove_region(
         disturbance=None if w is None else w[:n], extent=extent, ultimate_share=ultimate, plants=plants, set_up=set_up,
         precision=precision, distance_left=distance,
         readings=readings and replace(readings, errors=readings.errors[:n]), steps=problem.horizon if steps else None,
+        practical=practical,
     )  # fmt: skip
 
 
@@ -378,15 +402,15 @@ def _open_hole(
     budget: Budget,
     kept: KeptRegion | None,
 ) -> tuple[Contraction | None, float, float]:
-    """Open the hole: on a set where the law contracts; as large as disturbances or readings require; or as in a file.
+    """Open the hole: on a set where the law contracts; of a practical claim as large as required; or as in a file.
 
     Returns:
-        (the contraction, `slowest` as in contraction_around, the level up to which to prove). With a disturbance or
-        readings the first two are None and nan.
+        (the contraction, `slowest` as in contraction_around, the level up to which to prove). For a practical claim the
+        first two are None and nan.
     """
     levels = budget_for_level(budget)
-    if condition.disturbance is not None or condition.readings is not None:
-        level = just_below(rim) if kept is None else kept.level(True, rim)
+    if condition.is_practical:
+        level = _highest_level(condition, setting, rim, levels) if kept is None else kept.level(True, rim)
         hole = ultimate_level(condition, setting.domain, goal, level, levels) if kept is None else kept.hole
         condition.open_everywhere(hole)
         return None, math.nan, level
@@ -397,16 +421,19 @@ def _open_hole(
     )  # fmt: skip
     if kept is not None:
         level = kept.level(contraction is not None, rim)
-    elif rim < math.inf:
-        level = just_below(rim)
-    else:  # any level is possible: take one that V does not exceed on D
-        lower, upper = (side[None] for side in setting.domain)
-        level = -minimum(
-            lambda t, x: -condition.V(t, x), lower, upper, budget_for_level(budget), tolerance=LEVEL_TOLERANCE
-        )
+    else:
+        level = _highest_level(condition, setting, rim, budget_for_level(budget))
     if contraction is not None:
         condition.open_hole(contraction, setting.states, seen, level, budget_for_level(budget), kept and kept.hole)
     return contraction, slowest, level
+
+
+def _highest_level(condition: RecedingDecrease, setting: Setting, rim: float, budget: Budget) -> float:
+    """The level up to which to prove: just below rim; if any level is possible, one that V does not exceed on D."""
+    if rim < math.inf:
+        return just_below(rim)
+    lower, upper = (side[None] for side in setting.domain)
+    return -minimum(lambda t, x: -condition.V(t, x), lower, upper, budget, tolerance=LEVEL_TOLERANCE)
 
 
 def _half_of(budget: Budget) -> Budget:

@@ -22,9 +22,9 @@ from lyapnet.claims.certificates import (
 )
 from lyapnet.claims.held_laws import READINGS, control_of, readings_facts, readings_text
 from lyapnet.claims.preconditions import over_time
-from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
+from lyapnet.claims.receding_decrease import RecedingDecrease
 from lyapnet.claims.region import ProvedRegion
-from lyapnet.claims.stepped_decrease import IntoTheHole, SteppedDecrease
+from lyapnet.claims.stepped_decrease import SteppedDecrease
 from lyapnet.claims.tables import floored
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.condition import DecreaseCondition
@@ -38,7 +38,8 @@ PATHS, PATH_MARGIN = 16, 0.03  # number of drawn closed loops; they begin where 
 class RegionCertificate(Certificate):
     """A set that no closed loop of the receding law leaves, and from which all converge to one equilibrium.
 
-    With a disturbance, or if u is held, all closed loops enter a smaller set around the goal, which none leaves.
+    With a disturbance, if u is held, and for a practical claim, all closed loops enter a smaller set around the goal,
+    which none leaves.
     """
 
     kind: str = "region"
@@ -95,21 +96,24 @@ class RegionCertificate(Certificate):
             readings = readings and claim.plants.readings_of_all(readings)
         if claim.steps is not None:
             return *self._stepped(states), math.inf if claim.proof is None else claim.proof.wanted
-        condition = RecedingDecrease(loop, claim.decay, w, readings=readings)
-        if claim.hole > 0:
-            around = None if claim.contraction is None else claim.contraction.box
-            condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
+        condition = RecedingDecrease(loop, claim.decay, w, readings=readings, practical=claim.practical)
+        self._open_hole(condition)
         return condition, over_time(states, 0.0), claim.rim
+
+    def _open_hole(self, condition: RecedingDecrease) -> None:
+        """Exclude the hole of the claim from a condition."""
+        if (claim := self.claim).hole > 0:
+            condition.hole = claim.hole
+            condition.constraints = condition.outside_hole(claim.contraction and claim.contraction.box)
 
     def _stepped(self, states: Box) -> tuple[SteppedDecrease, tuple[Corner, Corner]]:
         """The condition of steps, and {0} × D."""
         problem, claim = copied(self.controller.problem), self.claim
         if claim.plants is not None:
             problem = claim.plants.problem(problem)
-        condition = SteppedDecrease(self._loop, claim.decay, problem)
+        condition = SteppedDecrease(self._loop, claim.decay, problem, practical=claim.practical)
         condition.keep_within(states, [i for i in range(claim.states.dimension) if i not in claim.left_out])
-        if claim.hole > 0:
-            condition.hole, condition.constraints = claim.hole, IntoTheHole(condition)
+        self._open_hole(condition)
         return condition, over_time(states, 0.0)
 
     @property
@@ -197,9 +201,8 @@ class RegionCertificate(Certificate):
                 )
             if claim.steps is not None:
                 return (
-                    "is a region of attraction of the receding law u(0, x) in discrete time, proved about the steps of "
-                    f"this model ({claim.steps.method}, Δt = {claim.steps.dt!r} s, u held over each){of_all}, and not "
-                    "about the plant between them: no sequence of steps that starts in it leaves it"
+                    f"is a region of attraction of the receding law u(0, x) in discrete time, {self._about_steps}"
+                    f"{of_all}, and not about the plant between them: no sequence of steps that starts in it leaves it"
                     f"{kept}, and {end}."
                 )
             return (
@@ -212,13 +215,25 @@ class RegionCertificate(Certificate):
         lower, upper = (side.tolist() for side in (claim.extent.lower, claim.extent.upper))
         seen = [i for i in range(len(names)) if i not in claim.left_out]
         within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
+        how = f"proved in continuous time {plants}{under}, {readings_text(claim.readings, system)}: no closed loop"
+        if claim.steps is not None:
+            how = (
+                f"in discrete time, {self._about_steps}{of_all}, and not about the plant between them: no sequence of "
+                "steps"
+            )
         return (
-            f"is invariant under the receding law u(0, x), proved in continuous time {plants}"
-            f"{under}, {readings_text(claim.readings, system)}: no closed loop that starts in it leaves it{kept}, and "
+            f"is invariant under the receding law u(0, x), {how} that starts in it leaves it{kept}, and "
             f"each enters {{x ∈ D: V(0, x) ≤ c}}, c = "
             f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
             f"ultimate bound). That set lies in {within}. Convergence to the goal or to rest is not claimed."
         )
+
+    @property
+    def _about_steps(self) -> str:
+        """What a claim about steps is about, in words."""
+        steps = self.claim.steps
+        assert steps is not None
+        return f"proved about the steps of this model ({steps.method}, Δt = {steps.dt!r} s, u held over each)"
 
     @property
     def _nominal_text(self) -> str:
@@ -249,7 +264,7 @@ class RegionCertificate(Certificate):
         rounded = ""
         if claim.precision is not None:
             rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
-        if claim.is_practical:
+        if claim.is_practical and claim.steps is None:
             c = repr(claim.hole) if claim.hole > 0 else "c"
             pushed = "".join(f", w({name}) = {w!r}" for name, w in self.disturbance.items())
             used, where = "u = u(0, x)", f"at each x ∈ D with {c} ≤ V ≤ {rho}"
@@ -264,7 +279,7 @@ class RegionCertificate(Certificate):
                 f"V = V(0, x), {used}{pushed}, {where}{plants}{rounded}",
                 inside,
             ]
-        hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
+        hole, rate = (repr(claim.hole) if claim.hole > 0 else "c"), ("κ" if B is None else repr(B.rate))
         if claim.steps is not None:
             dt, d = repr(claim.steps.dt), repr(claim.decay)
             inside = [f"V > {rho} wherever h_j(x) ≥ 0"] if claim.constraints else []
@@ -272,10 +287,15 @@ class RegionCertificate(Certificate):
                 ["B", "Y"] if B is None
                 else [f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]", f"Y = {B.coordinates.tolist()}"]
             )  # fmt: skip
-            return [
+            falls = [
                 f"V(F(x)) ≤ (1 − {dt} · {d}) max(V(x), {hole}) and F(x) ∈ D  with V = V(0, x), x⁺ = F(x) one step with "
                 f"u = u(0, x), at each x ∈ D with V ≤ {rho}{plants}{rounded}",
                 *inside,
+            ]
+            if claim.is_practical:
+                return falls
+            return [
+                *falls,
                 f"V > {hole} > 0 on D without {ends[0]}",
                 f"½(P J + JᵀP) + ½ · {dt} JᵀPJ ≤ −{rate} P  with P = YᵀY, J the Jacobian of (F(x) − x)/{dt}, at each "
                 f"x ∈ B, where F is continuous{plants}{', without rounding' * bool(rounded)}; {ends[1]}",

@@ -103,11 +103,18 @@ class SteppedDecrease(Stepped, RecedingDecrease):
 
     Args:
         problem: F is one step of its horizon's method, with u(0, x) held.
-        parameters: as in RecedingDecrease.
+        parameters, practical: as in RecedingDecrease.
     """
 
-    def __init__(self, closed_loop: ClosedLoop, decay: float, problem: Problem, parameters: Sequence[str] = ()):
-        RecedingDecrease.__init__(self, closed_loop, decay, parameters=parameters)
+    def __init__(
+        self,
+        closed_loop: ClosedLoop,
+        decay: float,
+        problem: Problem,
+        parameters: Sequence[str] = (),
+        practical: bool = False,
+    ):
+        RecedingDecrease.__init__(self, closed_loop, decay, parameters=parameters, practical=practical)
         dt = problem.horizon.dt
         if not decay * dt < 1:
             raise UsageError(f"Expected decay < 1/Δt = {1 / dt:g}, got {decay}; V cannot fall by more than itself.")
@@ -117,9 +124,14 @@ class SteppedDecrease(Stepped, RecedingDecrease):
         """Boxes that cover D without B; V > c on the boundary of B is not enough, since a step may jump over it."""
         return _outside(inner, states, seen)
 
-    def _hole_of(self, box: Box) -> Constraints:
+    def outside_hole(self, box: Box | None) -> Constraints:
         """Constraints h ≤ 0 that exclude the states from which a step leads into the hole."""
         return IntoTheHole(self)
+
+    def level_reached(self, t: Time, x: State) -> PerState:
+        """The level c up to which the hole has to reach if V does not fall at a state: V(F(x))/(1 − λΔt)."""
+        after = self.after(x, self.closed_loop.policy(t, x))
+        return self.V(t, after) / (1 - self.decay * self.problem.horizon.dt)
 
     def parts_under(self, t: Time, x: State, u: Control) -> tuple[PerState, PerState, PerState]:
         t, after = torch.zeros_like(t), self.after(x, u)

@@ -1,4 +1,4 @@
-"""The ultimate bound under disturbances: the level above which V falls under every disturbance."""
+"""The ultimate bound of practical stability: the level above which V falls, also under every disturbance."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,10 +8,11 @@ from torch import Tensor
 
 from lyapnet.base.types import Corner, Corners, PerState, State, Time, Value
 from lyapnet.claims.preconditions import at_time
+from lyapnet.claims.receding_decrease import RecedingDecrease
 from lyapnet.prover.bounds import BoundedFunction, Bounds
 from lyapnet.prover.boxes import Boxes, divide_box, root_box
 from lyapnet.prover.branch_and_bound import Budget, Question, choose_axis, minimum, run_search
-from lyapnet.prover.condition import DecreaseCondition, bounded_condition
+from lyapnet.prover.condition import bounded_condition
 from lyapnet.prover.taylor import TaylorForm, negate, shift
 from lyapnet.task.sets import Box
 
@@ -21,16 +22,18 @@ HELD_MARGIN = 0.3  # the former if u is held: V may rise by so much while a cont
 BOXES = 30_000  # largest number of boxes for the highest level at which V may rise while a control is held
 LEAST_SHARE = 0.003  # least share of D between two levels without samples at which V rises; less may be chance
 PIECES = 16  # number of boxes, about, into which the box of the constants is cut
-LEAST_LEVEL = 1e-6  # the smallest c, relative to the middle level
+LEAST_LEVEL = 1e-6  # the smallest c under a disturbance or a held control, relative to the middle level
+LEAST_LEVEL_ALONE = 1e-3  # the same without these: V may fall everywhere, and a smaller c takes more boxes
 
 
 def ultimate_level(
-    condition: DecreaseCondition, domain: tuple[Corner, Corner], goal: State, level: float, budget: Budget
+    condition: RecedingDecrease, domain: tuple[Corner, Corner], goal: State, level: float, budget: Budget
 ) -> float:
     """An estimate, with a margin, of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ; 0 if none is found.
 
     Samples give two levels between which the condition seems to hold. Below their mean, the highest V at which the
-    condition may fail is bounded from above, on pieces of the constants' box. The result needs a proof.
+    condition may fail is bounded from above, on pieces of the constants' box; for steps, the highest V that they lead
+    to from there. The result needs a proof.
 
     Args:
         condition: V̇ + λV, for V > 0.
@@ -56,8 +59,12 @@ def ultimate_level(
         room, budget = HELD_MARGIN, replace(budget, boxes=BOXES)
         bounded = _PossibleRise(bounded_condition(condition, domain, level=level), middle)
     lower, upper = divide_box(*condition.search_box(domain), [1 + i for i in constants], PIECES)
-    highest = -minimum(lambda t, x: -value(t, x), lower, upper, budget, possible, 0.0, bounded=bounded)
-    return min(middle, max((1 + room) * highest, LEAST_LEVEL * middle))
+    reached = value if condition.readings is not None else condition.level_reached
+    least = (LEAST_LEVEL_ALONE if condition.practical else LEAST_LEVEL) * middle
+    highest = -minimum(
+        lambda t, x: -reached(t, x).clamp_min(least), lower, upper, budget, possible, 0.0, bounded=bounded
+    )
+    return min(middle, (1 + room) * highest)
 
 
 class _PossibleRise(Bounds):
@@ -83,7 +90,7 @@ class _PossibleRise(Bounds):
 
 
 def _levels_of_fall(
-    condition: DecreaseCondition,
+    condition: RecedingDecrease,
     domain: tuple[Corner, Corner],
     goal: State,
     level: float,

@@ -209,6 +209,8 @@ def _annotation(f: dataclasses.Field[Any]) -> Any:
     if "doc" not in f.metadata:
         return f.type
     name, kind, rule = f"--{flag_of(f)}", kind_of_number(f), f.metadata
+    if isinstance(f.default, bool):
+        return Annotated[bool, typer.Option(name, help=rule["doc"])]
     if kind is None:
         several, _ = READ[f.name]
         texts = list[str] if several else str

@@ -32,7 +32,8 @@ def attack(proof: Path, checkpoint: str, loops: int, ascents: int) -> bool:
     if "steps" not in facts:
         raise SystemExit("Expected the proof of a region of steps, got another; see attack_held.")
     problem, loop = copied(controller.problem), copied(controller.closed_loop).requires_grad_(False)
-    D, rho, c = torch.tensor(result["set"], dtype=torch.float64), result["rho"], result["hole"]
+    D, rho = torch.tensor(result["set"], dtype=torch.float64), result["rho"]
+    c = result["ultimate_level" if facts.get("practical") else "hole"]
     q, t, goal = 1 - facts["decay"] * facts["steps"]["dt"], torch.zeros((), dtype=torch.float64), problem.goal.double()
 
     def step(x):

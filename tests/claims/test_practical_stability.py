@@ -26,7 +26,7 @@ from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import bounded_condition
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.sets import Box
-from lyapnet.task.systems import Linear
+from lyapnet.task.systems import ControlAffineSystem, Linear
 from lyapnet.value.policy import HJBPolicy
 from tests.claims.planted import Q, riccati, stationary
 from tests.claims.test_region import D, claimed, loop_of, plain_claim, problem
@@ -429,3 +429,59 @@ def test_the_command_takes_one_push_and_several(checkpoint, capsys, tmp_path):
     for wrong in (["--keep=proof"], ["--report=folder"], ["--disturbance=position=1"]):
         assert main([*line, "--disturbance=velocity=0,0.01", *wrong]) == 2
         assert "Expected one" in capsys.readouterr().err
+
+
+# Without disturbances
+
+
+class Cubic(ControlAffineSystem):
+    """ẋ = x − x³: the goal 0 is unstable, and all closed loops from x ≠ 0 go to ±1."""
+
+    state_names, control_names = ("x",), ("u",)
+
+    def f(self, x):
+        return x - x**3
+
+    def g(self, x):
+        return torch.zeros_like(x)[..., None]
+
+
+def test_a_loop_that_only_comes_near_the_goal_is_practically_stable():
+    """With V = x² is V̇ = 2x²(1 − x²), which is at most −λx² where x² ≥ 1 + λ/2."""
+    about = problem_of(Cubic(), None, 100, 0.02, Box([-0.8], [0.8]))
+    loop = loop_of(Formula(lambda t, x: (x**2).sum(-1) + 0 * t), about)
+    claim = prove_region(loop, about, 0.2, Box([-2.0], [2.0]), Budget(100, 1000, chunk=64), practical=True)
+    assert claim.verdict == "certified"
+    assert claim.contraction is None
+    assert 1.1 <= claim.hole < 1.1 * 1.02
+    assert claim.rho == pytest.approx(4, rel=1e-6)
+    assert float(claim.extent.upper) == pytest.approx(math.sqrt(claim.hole), rel=0.025)
+    alone = prove_region(loop, about, 0.2, Box([-2.0], [2.0]), Budget(100, 1000, chunk=64))
+    assert alone.rho == -math.inf
+    assert "does not stabilise the goal" in alone.reason
+
+
+@pytest.mark.gate
+def test_without_disturbances_the_claim_says_how_u_is_read():
+    claim = claimed(practical=True)
+    certificate = RegionCertificate(controller(), claim, {"seed": 0})
+    words = certificate.in_words()
+    assert "with u read at every t: no closed loop that starts in it leaves it" in words
+    assert "practical stability" in words
+    assert "under all disturbances" not in words
+    assert claim.rho == pytest.approx(plain_claim().rho, rel=1e-6)
+    names = [text.get_text() for text in certificate.figure().legends[0].get_texts()]
+    assert "V(0, x) ≤ c: entered, then never left" in names
+    assert not any("attracted" in name for name in names)
+    condition, _, _ = certificate.searched_condition()
+    x = D.sample(2000, torch.Generator().manual_seed(0)).double()
+    c, V = condition.values(torch.cat([torch.zeros(2000, 1), x], -1))
+    assert bool((c[(claim.rho >= V) & (claim.hole <= V)] <= 0).all())
+
+
+def test_the_option_is_a_switch():
+    region = Region(practical=True)
+    assert region.options["practical"] is True
+    command = RegionCertificate(controller(), None, region.options).command("best.ckpt")
+    assert "--practical" in command.split()
+    assert "practical" not in RegionCertificate(controller(), None, Region().options).command("best.ckpt")

@@ -1,5 +1,6 @@
 """Claims about the steps of a model against maps whose regions are known, and maps that only look stable."""
 
+import copy
 import json
 import math
 
@@ -25,7 +26,7 @@ from lyapnet.task.constraints import StateLimits
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlBox
-from lyapnet.task.systems import DoubleIntegrator, Linear, Pendulum
+from lyapnet.task.systems import ControlAffineSystem, DoubleIntegrator, Linear, Pendulum
 from lyapnet.value.policy import HJBPolicy, SampledPolicy
 from tests.problems import AMPLE, Formula, problem_of
 from tests.runs import tiny_checkpoint
@@ -335,3 +336,106 @@ def test_the_command_takes_steps(tmp_path, capsys):
     checkpoint = tiny_checkpoint(tmp_path / "logs")
     assert main(["certify", "region", str(checkpoint), "--time", "steps", "--seconds", "3", "--json"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["steps"].endswith("s, euler")
+
+
+# Practical stability
+
+
+class Cubic(ControlAffineSystem):
+    """Whose step of 1 s is x⁺ = 1.5 x − 0.5 x³: 0 is unstable, and all steps from |x| < √5 come to [−1, 1]."""
+
+    state_names, control_names = ("x",), ("u",)
+
+    def f(self, x):
+        return 0.5 * x - 0.5 * x**3
+
+    def g(self, x):
+        return torch.zeros_like(x)[..., None]
+
+
+class Leap(ControlAffineSystem):
+    """Whose step of 1 s halves x, and from near 0.25 leads up to 0.85 farther."""
+
+    state_names, control_names = ("x",), ("u",)
+
+    def f(self, x):
+        return -0.5 * x + 0.85 * torch.exp(-200 * (x - 0.25) ** 2)
+
+    def g(self, x):
+        return torch.zeros_like(x)[..., None]
+
+
+def steps_of_one_second(system):
+    return problem_of(system, None, 100, 1.0, Box([-0.5], [0.5]))
+
+
+@pytest.mark.gate
+def test_steps_that_only_come_near_the_goal_are_practically_stable():
+    """V = x² falls where 1 < x² < 5, and |F| ≤ 1 on [−1, 1]: c = 1."""
+    about, states = steps_of_one_second(Cubic()), ([-2.2], [2.2])
+    claim = claimed(about, states, decay=1e-4, practical=True)
+    assert claim.verdict == "certified"
+    assert claim.is_practical
+    assert claim.contraction is None
+    assert 1 <= claim.hole < 1.02
+    assert claim.rho == pytest.approx(2.2**2, rel=0.05)
+    assert float(claim.extent.upper) == pytest.approx(1, rel=0.03)
+    assert claimed(about, states, decay=1e-4).verdict == "unknown", "without it, convergence is claimed"
+
+
+def test_a_leap_out_of_a_set_on_which_V_rises_counts():
+    """V rises near x = 0.25, where V is 0.06; from there a step leads to 0.975."""
+    about, states = steps_of_one_second(Leap()), ([-2.0], [2.0])
+    x = torch.linspace(-2, 2, 400_001, dtype=torch.float64)[:, None]
+    after = x + about.system.f(x)
+    rises = after.abs() > x.abs()
+    farthest = float(after[rises].max())
+    assert float(x[rises].max()) < 0.5 * farthest
+    claim = claimed(about, states, decay=1e-4, practical=True)
+    assert claim.rho > claim.hole
+    assert farthest**2 < claim.hole < 1.05 * farthest**2
+
+
+def test_V_that_rises_at_most_levels_has_no_practical_region():
+    away = map_of([[1.1]], small=0.4)
+    assert claimed(away, ([-1.0], [1.0]), practical=True).rho == -math.inf
+
+
+@pytest.mark.gate
+def test_the_certificate_of_practical_steps_claims_no_convergence():
+    claim = claimed(turning(), UNIT, practical=True)
+    assert claim.verdict == "certified"
+    assert claim.contraction is None
+    certificate = RegionCertificate(controller(), claim, {"seed": 0})
+    words, result = certificate.in_words(), certificate.result
+    assert "in discrete time, proved about the steps of this model" in words
+    assert f"c = {claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability" in words
+    assert "is not claimed" in words
+    assert "read at every t" not in words
+    assert result["ultimate_level"] == claim.hole
+    assert "contraction_box" not in result
+    (falls,) = certificate.in_formulas()
+    assert f"max(V(x), {claim.hole!r}) and F(x) ∈ D" in falls
+    condition, _, _ = certificate.searched_condition()
+    x = Box([-1.0, -1.0], [1.0, 1.0]).sample(2000, torch.Generator().manual_seed(0)).double()
+    c, V = condition.values(torch.cat([torch.zeros(2000, 1), x], -1))
+    assert bool((c[claim.rho >= V] <= 0).all())
+
+
+@pytest.mark.gate
+def test_a_kept_proof_of_practical_steps_is_that_claim_alone(tmp_path):
+    path, about = tmp_path / "steps.proof", turning()
+    claim = claimed(about, UNIT, keep=path, practical=True)
+    result = check(controller(), path)
+    assert (result["verdict"], result["rho"], result["ultimate_level"]) == ("certified", claim.rho, claim.hole)
+    assert "contraction_rate" not in result
+    with pytest.raises(UsageError, match=r"Expected practical stability as in .*, got convergence; .+\."):
+        claimed(about, UNIT, keep=path)
+    proofs = kept_proofs.read_proofs(path)
+    for edit in ({"practical": False}, {"practical": "yes"}, {"hole": 1e-30}, {"hole": 5.0}, {"disturbance": [0.1, 0]}):
+        changed = copy.deepcopy(proofs)
+        changed["region"]["of"][0].update(edit)
+        kept_proofs.write_proofs(path, changed)
+        refused = check(controller(), path)
+        assert refused["verdict"] == "refused"
+        assert "\n" not in refused["reason"]

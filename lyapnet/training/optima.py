@@ -142,7 +142,8 @@ def _replace_improved(problem: Problem, optimum: Optimum, rows: Tensor, found: O
     if found.u is None:
         return optimum, 0
     size, cost = sizes(problem, optimum.path.cost)[rows], found.cost[: len(rows)]
-    better = torch.nonzero(cost < optimum.path.cost[rows] - (1 - ORACLE_IMPROVEMENT) * size).flatten()
+    has_controls = found.u[:, : len(rows)].isfinite().all(-1).all(0)
+    better = torch.nonzero(has_controls & (cost < optimum.path.cost[rows] - (1 - ORACLE_IMPROVEMENT) * size)).flatten()
     if len(better):
         closer = optimal_trajectories(problem, optimum.path.x[0, rows[better]], found.u[:, better], softer_first=False)
         optimum = _replace_rows(optimum, rows[better], closer)

@@ -464,3 +464,49 @@ def test_a_system_past_torch_is_refused(system):
     weight = torch.eye(4)
     with pytest.raises(OracleError, match=r"reads the values of a tensor at test_transcription\.py:\d+ \(return super"):
         oracle_of(problem_of(system, QuadraticCost(weight, [[1.0]], weight), 5))
+
+
+# Where a rollout of controls cannot follow the optimum
+
+
+def pole_of_ten_seconds(growth=4.0):
+    """ẍ = growth² x + u, whose rounding errors grow by e^(10 · growth) in a rollout."""
+    system = Linear([[0.0, 1.0], [growth**2, 0.0]], [[0.0], [1.0]])
+    return problem_of(system, QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2)), 200, 0.05)
+
+
+def test_an_optimum_that_no_controls_lead_along_is_confirmed_step_by_step():
+    problem, x0 = pole_of_ten_seconds(), torch.randn(4, 2)
+    optima = Transcription(problem).solve(x0)
+    assert optima.failures == 0
+    assert_close(
+        optima.cost, discrete_riccati(problem.system, problem.cost, problem.horizon).value(0, x0), rtol=1e-6, atol=0
+    )
+    assert optima.u.isnan().all(), "no controls are offered as the way to it"
+    calm = pole_of_ten_seconds(growth=0.1)
+    assert Transcription(calm).solve(x0).u.isfinite().all()
+
+
+def test_multipliers_are_the_slope_of_the_cost_to_go():
+    problem, x0 = pole_of_ten_seconds(), torch.tensor([1.0, -0.5])
+    oracle, riccati = Transcription(problem), discrete_riccati(problem.system, problem.cost, problem.horizon)
+    line = Candidate(np.linspace(x0.numpy(), 0, 201)[1:], np.zeros((200, 1)), math.inf)
+    found = oracle.minimise(x0.numpy(), line)
+    x = torch.from_numpy(found.x)[9].requires_grad_()
+    (slope,) = torch.autograd.grad(riccati.value(10, x), x)
+    assert_close(torch.from_numpy(found.multipliers)[9], slope, rtol=1e-4, atol=1e-6)
+
+
+def test_a_path_that_is_none_is_not_confirmed():
+    problem, x0 = pole_of_ten_seconds(), torch.tensor([1.0, -0.5])
+    oracle = Transcription(problem)
+    line = Candidate(np.linspace(x0.numpy(), 0, 201)[1:], np.zeros((200, 1)), math.inf)
+    found = oracle.minimise(x0.numpy(), line)
+    assert oracle._cost_along(x0, found) == pytest.approx(found.cost, rel=1e-6)
+    gap = found.x.copy()
+    gap[9] += 1e-3
+    for other in (
+        found._replace(x=gap), found._replace(cost=1.0001 * found.cost), found._replace(multipliers=None),
+        found._replace(x=np.full_like(found.x, np.nan)),
+    ):  # fmt: skip
+        assert oracle._cost_along(x0, other) is None

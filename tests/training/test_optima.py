@@ -74,6 +74,22 @@ def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, w
     assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
 
 
+def test_an_optimum_of_the_oracle_without_controls_replaces_none():
+    """Whose path no controls lead along; its twin with controls does."""
+    problem = hanging(steps=40)
+    x0 = problem.initial_states.sample(3)
+    idle = optimal_trajectories(problem, x0, torch.zeros(40, 3, 1), iterations=0)
+    good = optimal_trajectories(problem, x0, torch.zeros(40, 3, 1)).path
+    assert bool((good.cost < 0.9 * idle.path.cost).all())
+    u = good.u.clone()
+    u[:, 1] = torch.nan
+    found = Optima(good.cost, [""] * 3, u)
+    improved, count = optima._replace_improved(problem, idle, torch.arange(3), found)
+    assert count == 2
+    assert_close(improved.path.cost[1], idle.path.cost[1])
+    assert_close(improved.path.cost[::2], good.cost[::2], rtol=1e-6, atol=0)
+
+
 def test_controls_of_the_oracle_are_where_the_search_from_other_states_begins(monkeypatch, without_oracle):
     """But for the last one, which has none and begins with a neighbour's law."""
     problem, begun = hanging(steps=40), []

@@ -158,7 +158,7 @@ def test_a_fit_does_not_depend_on_the_pace_of_the_machine_unless_time_runs_out(p
 
     def weights_after(pause):
         clock = itertools.chain([0.0] * 3, itertools.repeat(pause))  # one slow step, as of a busy machine
-        monkeypatch.setattr(pretraining.time, "thread_time", lambda: next(clock))
+        monkeypatch.setattr(pretraining, "seconds_of_work", lambda: next(clock))
         torch.manual_seed(0)
         learner = learner_of(problem, 1.0)
         pretraining.fit_briefly(learner, examples)

@@ -23,7 +23,7 @@ class Optima:
     Attributes:
         cost: J*(x₀); NaN where no optimum was found.
         reasons: for each initial state the reason why no optimum was found; empty if it was found.
-        u: the optimal controls (N, b, m); None if the oracle has none.
+        u: the optimal controls (N, b, m), NaN where no controls lead along the optimum; None if the oracle has none.
     """
 
     cost: PerState

@@ -52,8 +52,10 @@ class Transcription(Oracle):
     line towards the goal, random curves, controls known to the caller, the optima of its neighbours in the batch, and a
     trial path if none of these leads to a minimum. If all guesses lead to one minimum for each of the first states, the
     other states use only their neighbours' optima. The reported cost is that of a rollout in torch; the best controls
-    are stored on disk. A state has NaN if no guess leads to a minimum or the rollout does not confirm it. If all of the
-    first few states fail, the others are not tried. Known controls that violate a constraint are ignored.
+    are stored on disk. Where the system amplifies rounding so much that no controls lead along the minimum, as over a
+    long time near an unstable equilibrium, it is the cost of IPOPT's own path, if the torch steps confirm it, and the
+    controls are NaN. A state has NaN if no guess leads to a minimum or it is not confirmed. If all of the first few
+    states fail, the others are not tried. Known controls that violate a constraint are ignored.
 
     Args:
         problem: the problem; it is copied to float64 on the CPU.
@@ -127,11 +129,11 @@ class Transcription(Oracle):
                 _SINGLE_MINIMUM_TASKS.discard(self._task_and_box)
             elif explored == EXPLORED and self._is_spread(states[pending[:EXPLORED]], search):
                 _SINGLE_MINIMUM_TASKS.add(self._task_and_box)
-        optima = self._verify(states, search, given)
+        cost, reasons, u = self._verify(states, search, given)
         for i, best in enumerate(search.best):
-            if best is not None and best is not stored[i] and not optima.reasons[i]:
+            if best is not None and best is not stored[i] and bool(u[:, i].isfinite().all()):
                 self.cache.write(states[i], torch.from_numpy(best.u))
-        return Optima(optima.cost.to(x0), optima.reasons, None if optima.u is None else optima.u.to(x0))
+        return Optima(cost.to(x0), reasons, u.to(x0))
 
     def _is_spread(self, states: Tensor, search: MultiStart) -> bool:
         """Whether EXPLORED states have a minimum and extend over MIN_SPREAD of X₀ in each component."""
@@ -148,16 +150,21 @@ class Transcription(Oracle):
             u = torch.stack([controls[i] for i in some], 1)  # pyright: ignore[reportArgumentType]
             with torch.no_grad():
                 x, J = self.rollout(states[some], u)
-                admitted = torch.isfinite(x).all(-1).all(0) & J.isfinite()
-                if self.problem.domain is not None:
-                    admitted &= ~self.problem.domain.left(x, slack=0.0)
-                if self.problem.constraints is not None:
-                    admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= CONSTRAINT_TOLERANCE
+                admitted = self._are_admitted(x) & J.isfinite()
             columns = (x.unbind(1), u.unbind(1), J.tolist(), admitted.tolist())
             for i, path, control, cost, good in zip(some, *columns, strict=True):
                 if good:
                     candidates[i] = Candidate(path[1:].numpy(), control.numpy(), cost)
         return candidates
+
+    def _are_admitted(self, x: StatePath) -> Tensor:
+        """Whether trajectories are finite, satisfy the constraints and stay within the domain."""
+        admitted = torch.isfinite(x).all(-1).all(0)
+        if self.problem.domain is not None:
+            admitted &= ~self.problem.domain.left(x, slack=0.0)
+        if self.problem.constraints is not None:
+            admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= CONSTRAINT_TOLERANCE
+        return admitted
 
     def _starts(
         self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None], search: MultiStart
@@ -239,18 +246,48 @@ class Transcription(Oracle):
         u, x, _ = np.split(np.asarray(result["x"]).ravel(), [start.u.size, start.u.size + start.x.size])
         u = of_u * u.reshape(start.u.shape)
         u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # IPOPT may slightly violate U
-        return Candidate(of_x * x.reshape(start.x.shape), u, scale * float(result["f"]))
+        multipliers = np.asarray(result["lam_g"]).ravel()[: start.x.size].reshape(start.x.shape)
+        return Candidate(
+            of_x * x.reshape(start.x.shape), u, scale * float(result["f"]), scale / of_x * multipliers
+        )  # fmt: skip
 
-    def _verify(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
-        """The costs of the best controls in a rollout; NaN if the rollout does not confirm them."""
+    def _verify(
+        self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]
+    ) -> tuple[PerState, list[str], ControlPath]:
+        """(costs of the best controls in a rollout, or along IPOPT's paths, reasons why there is none, the controls).
+
+        Costs are NaN if neither confirms them, and controls if a rollout does not.
+        """
         replayed = self._replay(states, [None if b is None else torch.from_numpy(b.u) for b in search.best])
-        reasons = list(map(_reason_to_reject, search.best, replayed, given, search.reasons))
         cost = torch.full((len(states),), math.nan, dtype=torch.float64)
         u = torch.full((self.problem.horizon.steps, len(states), self.problem.system.m), math.nan, dtype=torch.float64)
-        for i, candidate in enumerate(replayed):
-            if candidate is not None and not reasons[i]:
+        reasons = list[str]()
+        for i, (best, candidate) in enumerate(zip(search.best, replayed, strict=True)):
+            reason = _reason_to_reject(best, candidate, given[i], search.reasons[i])
+            if not reason and candidate is not None:
                 cost[i], u[:, i] = candidate.cost, torch.from_numpy(candidate.u)
-        return Optima(cost, reasons, u)
+            elif best is not None and (along := self._cost_along(states[i], best)) is not None:
+                cost[i], reason = along, _reason_against(given[i], best._replace(cost=along))
+                cost[i] = math.nan if reason else along
+            reasons.append(reason)
+        return cost, reasons, u
+
+    def _cost_along(self, x0: State, minimum: Candidate) -> float | None:
+        """The cost of a minimum's own path, whose steps are taken one by one in torch; None if it is not confirmed.
+
+        To first order the cost of a path that closes the gaps d_n = F(x_n, u_n) − x_{n+1} differs by Σ λ_{n+1}ᵀd_n,
+        with the multipliers λ. This must be as small as the difference that a rollout is allowed.
+        """
+        if minimum.multipliers is None:
+            return None
+        x, u = torch.cat([x0[None], torch.from_numpy(minimum.x)]), torch.from_numpy(minimum.u)
+        with torch.no_grad():
+            following, step_cost = self.problem.step(x[:-1], u)
+            cost = float(step_cost.sum() + self.problem.cost.terminal(x[-1]))
+            by_gaps = float((torch.from_numpy(minimum.multipliers) * (following - x[1:])).sum(-1).abs().sum())
+            admitted = bool(self._are_admitted(x[:, None]).all())
+        confirmed = max(by_gaps, abs(cost - minimum.cost)) <= _tolerance(minimum.cost)
+        return cost if admitted and confirmed else None
 
 
 def _with_fallback(search: MultiStart, i: int, starts: Sequence[Candidate], last: Candidate) -> Iterator[Candidate]:
@@ -264,12 +301,22 @@ def _reason_to_reject(best: Candidate | None, replayed: Candidate | None, given:
     """The reason why a cost is not accepted as the optimum; empty if it is accepted."""
     if best is None:
         return reason
-    if replayed is None or abs(replayed.cost - best.cost) > SAME * abs(best.cost) + 1e-9:
+    if replayed is None or abs(replayed.cost - best.cost) > _tolerance(best.cost):
         got = "no finite number" if replayed is None else f"{replayed.cost:.9g}"
         return f"IPOPT's cost {best.cost:.9g} is {got} in a rollout of its controls"
-    if is_better(given, replayed):
+    return _reason_against(given, replayed)
+
+
+def _reason_against(given: Candidate | None, best: Candidate) -> str:
+    """The reason why a minimum is not the optimum: cheaper known controls; empty if there are none."""
+    if is_better(given, best):
         return f"known controls cost less than the {best.cost:.6g} of every local minimum that was found"
     return ""
+
+
+def _tolerance(cost: float) -> float:
+    """The difference up to which IPOPT's cost and that in torch count as equal."""
+    return SAME * abs(cost) + 1e-9
 
 
 class _IterationLimit(casadi.Callback):

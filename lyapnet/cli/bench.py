@@ -1,4 +1,4 @@
-"""lyapnet bench gradient | certify | law."""
+"""lyapnet bench gradient | certify | law | optima."""
 
 import json
 from dataclasses import asdict
@@ -31,9 +31,9 @@ app = typer.Typer(cls=WithDefault)
 
 @app.callback()
 def bench() -> None:
-    """Measure gradients of a loss, which is what no name means, bounds, or one control, each against alternatives.
+    """Measure gradients of a loss, which is what no name means, bounds, one control, or optima, against alternatives.
 
-    lyapnet bench gradient --help, and certify and law likewise, say more.
+    lyapnet bench gradient --help, and certify, law and optima likewise, say more.
     """
 
 
@@ -204,6 +204,40 @@ def law(
         print(json.dumps([asdict(row) for row in rows]))
     else:
         Console(highlight=False, markup=False).print(latency_table(rows, given.title))
+
+
+@app.command()
+def optima(
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."
+        ),
+    ] = None,
+    compared: Annotated[int, typer.Option(min=0, help="Optima that the oracle finds too.")] = 64,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Time the optima from which a training starts; compare their costs with the oracle's, of the extra oracle.
+
+    lyapnet bench optima --task pendulum_swingup,quadrotor
+    """
+    from lyapnet.lab.bench import load_case, use_threads
+    from lyapnet.lab.bench.optima import time_optima
+    from lyapnet.lab.bench.tables import optima_table
+
+    use_threads(1)
+    with stages_of("optima") as report:
+        cases = [load_case(name, overrides or []) for name in _items(task) or ["double_integrator"]]
+        rows = [time_optima(case, compared, report) for case in cases]
+        report.rest()
+    if as_json:
+        print(json.dumps([plain(asdict(row)) for row in rows]))
+    else:
+        Console(highlight=False, markup=False).print(optima_table(rows))
 
 
 def _items(values: list[str] | None) -> list[str]:

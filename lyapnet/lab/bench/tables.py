@@ -6,6 +6,7 @@ from typing import Any
 from rich.table import Column, Table
 
 from lyapnet.lab.bench.latency import Latency
+from lyapnet.lab.bench.optima import EQUAL, OptimaTiming
 from lyapnet.lab.bench.proofs import Attempt
 from lyapnet.lab.bench.routes import BASELINE
 from lyapnet.lab.bench.tightness import Tightness
@@ -65,4 +66,22 @@ def latency_table(rows: Sequence[Latency], title: str) -> Table:
     table.title = f"{title}\nmicroseconds of u(t, x), 1 kHz"
     for row in rows:
         table.add_row(row.way, f"{row.calls:,}", *(f"{value:,.1f}" for value in (row.median, row.most, row.worst)))
+    return table
+
+
+def optima_table(rows: Sequence[OptimaTiming]) -> Table:
+    """Seconds for the optima of each task, and their costs beside the oracle's."""
+    names = ("optima", "seconds", "compared", "excess", "saving", "as low")
+    table = Table("task", *(Column(name, justify="right") for name in names))
+    table.title = "optima from which a training starts, one thread"
+    table.caption = (
+        "excess and saving: the largest, relative to the oracle's cost; as low: the share of states with an excess of "
+        f"at most {EQUAL:.0e}"
+    )
+    for row in rows:
+        beside = ("–", "–", "–")
+        if row.compared:
+            numbers = (max(number, 0.0) for number in (row.largest_excess, row.largest_saving))
+            beside = (*(f"{number:.0e}" for number in numbers), f"{row.as_low:.1%}")
+        table.add_row(row.task, str(row.found), f"{row.seconds:.1f}", str(row.compared), *beside)
     return table

@@ -79,7 +79,7 @@ def film_of(learner: Learner) -> Film:
     """The animation of closed loops from five states of X₀."""
     x0 = learner.problem.initial_states.sample(5, stream(learner.seed, FIGURES))
     with torch.no_grad():
-        return Film(learner.roll_out(x0, FIGURES), learner.problem, learner.V, rate=15)
+        return Film(learner.roll_out(x0, FIGURES), learner.problem, learner.V, rate=10)
 
 
 def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:

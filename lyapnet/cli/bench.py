@@ -28,6 +28,12 @@ class WithDefault(TyperGroup):
 
 app = typer.Typer(cls=WithDefault)
 
+Overrides = Annotated[list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")]
+Tasks = Annotated[
+    list[str] | None,
+    typer.Option(help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."),
+]
+
 
 @app.callback()
 def bench() -> None:
@@ -39,15 +45,8 @@ def bench() -> None:
 
 @app.command(DEFAULT)
 def gradient(
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")
-    ] = None,
-    task: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."
-        ),
-    ] = None,
+    overrides: Overrides = None,
+    task: Tasks = None,
     batch: Annotated[list[str] | None, typer.Option(help="Numbers of initial states; 12,64,512 if none.")] = None,
     routes: Annotated[list[str] | None, typer.Option(help="Some of the above; all that can run here if none.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
@@ -208,15 +207,8 @@ def law(
 
 @app.command()
 def optima(
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")
-    ] = None,
-    task: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."
-        ),
-    ] = None,
+    overrides: Overrides = None,
+    task: Tasks = None,
     compared: Annotated[int, typer.Option(min=0, help="Optima that the oracle finds too.")] = 64,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
     debug: Debug = False,

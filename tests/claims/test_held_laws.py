@@ -350,7 +350,7 @@ def test_parameters_and_readings_together():
     assert "read at any times at most 0.1 s apart" in certificate.in_words()
 
 
-@pytest.mark.parametrize("V", [lambda t, x: 5 - (x**2).sum(-1) + 0 * t, lambda t, x: 0 * t + 0 * x.sum(-1)])
+@pytest.mark.parametrize("V", sample([lambda t, x: 0 * t + 0 * x.sum(-1), lambda t, x: 5 - (x**2).sum(-1) + 0 * t], 2))
 def test_where_the_level_set_is_empty_nothing_is_claimed(V):
     about, _ = integrator()
     loop = ClosedLoop(about, HJBPolicy(about, Formula(V))).double()

@@ -208,6 +208,7 @@ def test_a_killed_comparison_goes_on(killed, length, tmp_path):
     assert Result.read(job / "result.json").environment_steps >= length
 
 
+@pytest.mark.gate
 def test_costs_without_their_optimum_are_told_before_anything_is_trained(monkeypatch, capsys):
     jobs = jobs_of(load_comparison(SMOKE), ["reacher", "double_integrator"], ["ppo_tuned"])
     tell_of_missing_optima(jobs, Console())

@@ -204,6 +204,7 @@ def test_the_loop_of_the_page_runs(capsys):
     assert capsys.readouterr().out == "[0.]\n"
 
 
+@pytest.mark.gate
 def test_a_command_measures_dead_time(capsys):
     """Without any, and with what acts known, the cost is that of the evaluation's own loops."""
     readings = ["--outputs", "cart position=0.012", "--outputs", "pole angle=0.012"]

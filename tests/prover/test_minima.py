@@ -115,7 +115,7 @@ def polynomial(form, epsilon):
 CASES = [(name, m, kind) for m in (1, 2, 3) for name in pairs(m) for kind in KINDS if m > 1 or kind != "full"]
 
 
-@pytest.mark.parametrize(("name", "m", "kind"), sample(CASES, 12))
+@pytest.mark.parametrize(("name", "m", "kind"), sample(CASES, 24))
 def test_no_control_lies_outside(name, m, kind):
     for degree in (1, 2, 3):
         samples, outside, _ = examine(*pairs(m)[name], m, kind, degree, 200, 20)

@@ -147,6 +147,7 @@ def test_an_X0_of_one_point(task):
     assert all(buffer.isfinite().all() for buffer in learner.V.buffers())
 
 
+@pytest.mark.gate
 def test_every_seed_of_an_ensemble_starts_from_it():
     members, start = started(LINEAR, "seeds=2")
     x = members[0].problem.initial_states.sample(5)

@@ -71,6 +71,7 @@ def test_the_claim_names_the_file_and_how_far_it_is_off(exported):
     )
 
 
+@pytest.mark.gate
 def test_the_file_stays_within_the_bound(exported):
     controller, folder, _, certificate = exported
     program = CompiledLaw(folder, Law(controller), 1, FLAGS, Style(dtype=torch.float32))

@@ -108,12 +108,14 @@ def test_cubic_friction_is_found():
     assert np.sqrt(np.mean((got - lacking) ** 2)) < 0.35 * np.sqrt(np.mean(lacking**2))
 
 
+@pytest.mark.gate
 def test_a_right_model_needs_none():
     _, residual = found(0.0, 20.0, units=6)
     assert not residual.needed
     assert residual.ratio == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.gate
 def test_without_data_that_are_held_out_nothing_is_claimed():
     config, data = config_from_plain(TASK), [recording(0.5, 10.0)]
     residual = identify_residual(config, data, identify(config, data, held_out=0.0), held_out=0.0, units=2)

@@ -26,6 +26,7 @@ from lyapnet.value.expansions import (
 )
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
+from tests.marks import sample
 from tests.problems import problem_of
 
 
@@ -205,6 +206,7 @@ def test_the_lookahead_law_is_the_least_of_a_grid(task):
     assert (Q(sampled) > Q(u) + 1e-7).any()
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("law", [SampledPolicy, LookaheadPolicy])
 @pytest.mark.parametrize("task", ["bicycle", "glider"])
 def test_the_gradient_through_closed_loops_is_that_of_differences(task, law):
@@ -245,7 +247,7 @@ def test_laws_that_are_formulas_of_f_and_g_are_refused(law):
 # Optima
 
 
-@pytest.mark.parametrize("method", ["euler", "rk4"])
+@pytest.mark.parametrize("method", sample(["euler", "rk4"], 2))
 def test_differential_dynamic_programming_agrees_with_ipopt(method, tmp_path, monkeypatch):
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path))
     problem = glider(method=method)

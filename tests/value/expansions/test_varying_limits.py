@@ -73,6 +73,7 @@ def test_the_optimum_is_that_of_another_solver():
         assert_close(optimum_of(motor(ControlBox(-1.5, 2.0)), STARTS).path.cost, expected, rtol=1e-3, atol=0)
 
 
+@pytest.mark.gate
 def test_the_slope_of_the_optimum_knows_how_limits_move():
     """V_x and V_xx of the expansion against differences of optima from states beside."""
     step = 1e-4

@@ -340,9 +340,9 @@ class ReadAtTimes(Claim):
         0.0, "Seconds from a reading to the use of its control, at most.", at_least=0, remedy="give it in s"
     )  # fmt: skip
     measured: Mapping[str, float] | None = option(
-        None, "The largest error of a state where it is read; may be given again.", metavar="STATE=E",
+        None, "The largest error of a state where it is read; may be repeated.", metavar="STATE=E",
         check=check_errors,
     )  # fmt: skip
     quantised: Mapping[str, float] | None = option(
-        None, "The step to which a control is rounded; may be given again.", metavar="CONTROL=STEP", check=check_errors
+        None, "The step to which a control is rounded; may be repeated.", metavar="CONTROL=STEP", check=check_errors
     )  # fmt: skip

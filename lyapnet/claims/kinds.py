@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # as in claim.py
 RADIUS = "Success at T needs ‖x(T) − goal‖ within it; not asked for if none."
 SLACK = "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none."
 SET = "The set D, as lower:upper,…; found if none."
-DISTURBANCE = "The largest push on the derivative of a state; may be given again."
+DISTURBANCE = "The largest disturbance of the rate of a state; may be repeated."
 NORM, RATE = "give it in the norm of x", "give it in cost per second"  # remedies in error messages
 
 
@@ -213,7 +213,7 @@ class Reach(Claim):
         None, "The set to reach, as lower:upper,…; it is needed.", metavar="BOX", check=sides_of
     )  # fmt: skip
     avoid: "Sequence[Box | Sequence[Sequence[float]]] | None" = option(
-        None, "A set not to be met before, as lower:upper,…; may be given again.", metavar="BOX", check=check_boxes
+        None, "A set not to be met before, as lower:upper,…; may be repeated.", metavar="BOX", check=check_boxes
     )  # fmt: skip
     noise: Mapping[str, float] | None = option(
         None, "σ of a state's noise, in its unit per √s; that of the task if none. May be given again.",

@@ -1,6 +1,6 @@
 """The command line: lyapnet check | trim | identify | train | evaluate | animate | view | export | sweep | tune | …
 
-A command imports what it needs when it runs: help and misspelt options are answered at once.
+Commands import what they need when they run, so that help and misspelt options are answered at once.
 """
 
 import gc
@@ -30,8 +30,9 @@ from lyapnet.cli.tune import tune
 from lyapnet.cli.view import view
 from lyapnet.cli.zoo import demo, zoo
 
-ALLOCATIONS = 10_000  # between two searches for garbage; with Python's 700 they take a seventh of a short training
-CLOSED_OUTPUT = 141  # the exit status of what the signal SIGPIPE ended, which not every system knows
+# Allocations between two searches for garbage; with Python's 700 these take a seventh of a short training.
+ALLOCATIONS = 10_000
+CLOSED_OUTPUT = 141  # exit status of a process that the signal SIGPIPE ended; not every system has this signal
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -40,7 +41,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 def lyapnet(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
-    """Learn time-varying value functions and Lyapunov functions, and measure what they are worth."""
+    """Learn value functions and Lyapunov functions, and measure how good they are."""
     if version:
         from lyapnet import __version__
 
@@ -69,10 +70,10 @@ for group in (certify, bench):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly, 141 nobody reads it."""
+    """Run a command; return 0 if done or interrupted, 1 if failed, 2 if misused, 141 if its output is closed."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        with signals_taken(_stop), _rare_searches_for_garbage():
+        with signals_taken(_stop), _collect_garbage_rarely():
             status = app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
             sys.stdout.flush()
             return status
@@ -90,8 +91,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 @contextmanager
-def _rare_searches_for_garbage() -> Iterator[None]:
-    """Let Python search for garbage after ALLOCATIONS at the earliest; there is little, among very many objects."""
+def _collect_garbage_rarely() -> Iterator[None]:
+    """Search for garbage only after ALLOCATIONS, because there are very many objects and little garbage."""
     before = gc.get_threshold()
     gc.set_threshold(max(before[0], ALLOCATIONS), *before[1:])
     try:
@@ -105,9 +106,9 @@ def _stop(number: int, frame: Any) -> None:
 
 
 def _is_closed_output(error: BaseException) -> bool:
-    """Whether nobody reads the output any more, as after `| head -1`; what is left of it goes nowhere then.
+    """Whether the output is closed, as after `| head -1`; the rest of the output is then discarded.
 
-    Rich and Typer make a SystemExit of it.
+    Rich and Typer raise SystemExit in this case.
     """
     if not isinstance(error.__context__ if isinstance(error, SystemExit) else error, BrokenPipeError):
         return False
@@ -117,7 +118,7 @@ def _is_closed_output(error: BaseException) -> bool:
 
 
 def _explain(error: Any) -> tuple[str, int]:
-    """One line and the exit status for an exception that reached the user."""
+    """One line for the user, and the exit status, for an exception."""
     if isinstance(error, LyapnetError):
         more = f" More: docs/troubleshooting.md#{error.section}." if error.section else ""
         return f"error: {' '.join(str(error).split())}{more}", error.exit_status

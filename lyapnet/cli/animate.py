@@ -7,10 +7,10 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.options import Debug, Given, with_controller_options
 
 
-@of_a_controller
+@with_controller_options
 def animate(
     given: Given,
     out: Annotated[Path, typer.Option(help="The file: a .gif, or an .mp4 where ffmpeg is installed.")],
@@ -21,14 +21,15 @@ def animate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
     rate: Annotated[float, typer.Option("--frames-per-second", help="Of the animation.")] = 20.0,
     speed: Annotated[
-        float | None, typer.Option(help="1 is real time; without it, that or what makes 3 to 10 s.")
+        float | None,
+        typer.Option(help="1 is real time; by default that, or the speed with which the film takes 3 to 10 s."),
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Show closed loops in motion, beside their controls, cost and V.
+    """Animate closed loops, with their controls, cost and V.
 
-    The shapes are those of the system's `draw`; of a system without any, it is the plane of two states with level sets
-    of V(t, ·).
+    The system is drawn by its method `draw`; without one, the film shows the plane of two states with level sets of
+    V(t, ·).
     """
     from lyapnet.base.random_streams import FIGURES, stream
     from lyapnet.evaluation.animation import Film

@@ -13,13 +13,13 @@ from typer.core import TyperGroup
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import plain
 from lyapnet.base.sizes import THREADS
-from lyapnet.cli.options import Debug, Given, of_a_controller, stages_of
+from lyapnet.cli.options import Debug, Given, make_stages, with_controller_options
 
 DEFAULT = "gradient"
 
 
 class WithDefault(TyperGroup):
-    """A group of commands; what names none of them is for the default one."""
+    """A group of commands with a default command."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = args and (args[0] in self.commands or args[0] == "--help")
@@ -37,9 +37,9 @@ Tasks = Annotated[
 
 @app.callback()
 def bench() -> None:
-    """Measure gradients of a loss, which is what no name means, bounds, one control, or optima, against alternatives.
+    """Measure gradients of a loss (the default), bounds, one control, or optima, each against alternatives.
 
-    lyapnet bench gradient --help, and certify, law and optima likewise, say more.
+    See lyapnet bench gradient --help, and likewise certify, law and optima.
     """
 
 
@@ -48,8 +48,10 @@ def gradient(
     overrides: Overrides = None,
     task: Tasks = None,
     batch: Annotated[list[str] | None, typer.Option(help="Numbers of initial states; 12,64,512 if none.")] = None,
-    routes: Annotated[list[str] | None, typer.Option(help="Some of the above; all that can run here if none.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
+    routes: Annotated[
+        list[str] | None, typer.Option(help="Some of the routes above; all that can run here if none.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of timings; their median counts.")] = 7,
     threads: Annotated[int, typer.Option(min=1, max=THREADS, help="CPU threads.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
     figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
@@ -87,7 +89,7 @@ def gradient(
     batches = [_count("--batch", text) for text in _items(batch) or ["12", "64", "512"]]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, report = Console(highlight=False, markup=False), stages_of("gradient")
+    console, report = Console(highlight=False, markup=False), make_stages("gradient")
     say, rows = partial(report.console.print, soft_wrap=True), []
     if not has_compiler():
         say("No C++ compiler ($CXX, g++ or clang++): compiled rows are left out.")
@@ -110,17 +112,17 @@ def gradient(
 def certify(
     checkpoint: Annotated[
         Path | None,
-        typer.Argument(help="Whose condition is bounded; of a fresh tanh network if none.", metavar="[CKPT]"),
+        typer.Argument(help="The controller whose condition is bounded; a new tanh network if none.", metavar="[CKPT]"),
     ] = None,
-    dimensions: Annotated[str, typer.Option(help="Chains of integrators, by their numbers.")] = "2,3,4,5",
-    seconds: Annotated[float, typer.Option(min=0, help="For each proof, before it is unknown.")] = 60.0,
-    boxes: Annotated[int, typer.Option(min=1, help="Boxes of each side, over which medians are taken.")] = 200,
-    repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
+    dimensions: Annotated[str, typer.Option(help="Lengths of the chains of integrators.")] = "2,3,4,5",
+    seconds: Annotated[float, typer.Option(min=0, help="Time limit of each proof.")] = 60.0,
+    boxes: Annotated[int, typer.Option(min=1, help="Boxes of each size, for medians.")] = 200,
+    repeats: Annotated[int, typer.Option(min=1, help="Number of timings; their median counts.")] = 7,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     figures: Annotated[Path | None, typer.Option(help="Write certify_bench.png there.", metavar="FOLDER")] = None,
     debug: Debug = False,
 ) -> None:
-    """Hold the certifier's bounds against plain interval arithmetic and mean-value forms.
+    """Compare the bounds of the prover with plain interval arithmetic and mean-value forms.
 
     Tightness: c = V̇ + αℓ − δ on random boxes in [0, T] × X₀, by sides as
     shares of the axes. The factor is the width of the enclosure over that
@@ -128,8 +130,8 @@ def certify(
     difference of these widths. Boxes per second are timed in turns.
 
     Proofs: V of the Riccati equation on chains of 2 to 5 integrators, for
-    which c ≤ 0 is true, and a twin for which it is not. By the certifier,
-    and by plain bisection with each enclosure. A method that stays unknown
+    which c ≤ 0 is true, and a twin for which it is false, by the prover and
+    by plain bisection with each enclosure. A method that finds no verdict
     is not tried on longer chains.
 
     lyapnet bench certify --figures out
@@ -145,7 +147,7 @@ def certify(
     lengths = [_count("--dimensions", text) for text in _items([dimensions])]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, report = Console(highlight=False, markup=False), stages_of("certify")
+    console, report = Console(highlight=False, markup=False), make_stages("certify")
     notes, proofs = report.console, []
     case = condition_of_network() if checkpoint is None else condition_of_controller(load(checkpoint))
     with report:
@@ -173,7 +175,7 @@ def certify(
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def law(
     given: Given,
     seconds: Annotated[float, typer.Option(min=0.01, help="For each way.")] = 10.0,
@@ -233,7 +235,7 @@ def optima(
 
 
 def _items(values: list[str] | None) -> list[str]:
-    """The entries of a repeated option, each of which may hold several after commas."""
+    """The entries of a repeated option, each of which may hold several between commas."""
     return list(dict.fromkeys(item.strip() for value in values or [] for item in value.split(",")))
 
 
@@ -244,7 +246,7 @@ def _count(option: str, text: str) -> int:
 
 
 def _write_figures(folder: Path, first: Any, rows: list[Any]) -> list[Path]:
-    """The figures that these rows fill, and the gradient errors of the first task."""
+    """Write the figures for which there are rows, and that of the gradient errors of the first task."""
     from lyapnet.lab.bench import figures, gradient_accuracy, is_chain
 
     horizon = first.problem.horizon

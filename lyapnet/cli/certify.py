@@ -25,39 +25,39 @@ from lyapnet.cli.claims import (
     TwoSided,
     Value,
     Workers,
-    law_of,
-    note_written,
-    pushes_of_one_state,
+    load_exported_law,
+    print_written,
+    read_disturbances_of_one_state,
 )
-from lyapnet.cli.options import Debug, Given, of_a_controller, read_pushes
+from lyapnet.cli.options import Debug, Given, read_numbers, with_controller_options
 
 app = typer.Typer(cls=ByKind)
 
 
 @app.callback()
 def certify() -> None:
-    """Certify a controller: on how much of X₀ it keeps its promises, and how sure that is.
+    """Certify a controller: the share of X₀ on which a claim holds, and how sure that is.
 
     Verdicts: certified, falsified (with a state), unknown. Without the name of a kind, statistical.
     """
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def sampled(given: Given, claim: Sampled, output: Output, debug: Debug = False) -> None:
-    """The share of some states whose closed loop succeeds. It proves no more."""
+    """The share of sampled states whose closed loop succeeds; no statement about other states."""
     _draw(given, claim, output)
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def statistical(given: Given, claim: Statistical, output: Output, debug: Debug = False) -> None:
     """A share of X₀ that succeeds, with a confidence."""
     _draw(given, claim, output)
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def sound(
     given: Given, claim: Funnel, search: SearchAnywhere, refining: Refining, output: Output,
     two_sided: TwoSided = False, debug: Debug = False,
@@ -69,7 +69,7 @@ def sound(
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def noisy(
     given: Given,
     claim: NoisyFunnel,
@@ -83,7 +83,7 @@ def noisy(
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def reach(
     given: Given,
     claim: Reach,
@@ -97,7 +97,7 @@ def reach(
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def region(
     given: Given,
     claim: Region,
@@ -107,7 +107,7 @@ def region(
     disturbance: Annotated[
         list[str] | None,
         typer.Option(
-            help="The largest push on the derivative of a state; may be given again. STATE=W,W claims for each W.",
+            help="The largest disturbance of the rate of a state; may be repeated. STATE=W,W: one claim for each.",
             metavar="STATE=W",
         ),
     ] = None,
@@ -115,7 +115,7 @@ def region(
     law: Law = None,
     debug: Debug = False,
 ) -> None:
-    """A region of attraction of the receding law u(0, x), for ever: proved."""
+    """A region of attraction of the receding law u(0, x), for all times: proved."""
     several = any("," in each for each in disturbance or ())
     if refining.refine and (several or value or law or claim.parameters):
         got = "--parameter" if claim.parameters else "several or --value"
@@ -124,17 +124,17 @@ def region(
         raise UsageError("Expected one disturbance with --keep, --report or --ray, got several; name one for each.")
     given = given.with_functions(value, law)
     if several:
-        return _prove_for_each(given, claim, *pushes_of_one_state(disturbance or []), search, output)
-    return _prove(given, [replace(claim, disturbance=read_pushes(disturbance or []))], search, refining, output)
+        return _prove_for_each(given, claim, *read_disturbances_of_one_state(disturbance or []), search, output)
+    return _prove(given, [replace(claim, disturbance=read_numbers(disturbance or []))], search, refining, output)
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def tube(
     given: Given, claim: Tube, below: LowerBound, search: Search, output: Output, two_sided: TwoSided = False,
     debug: Debug = False,
 ) -> None:  # fmt: skip
-    """Where all closed loops from X₀ go up to T, and what they cost: proved."""
+    """A tube that holds all closed loops from X₀ up to T, and bounds of their cost: proved."""
     alone = [flag_of(f) for f in dataclasses.fields(below) if getattr(below, f.name) is not None]
     if alone and not two_sided:
         raise UsageError(f"Expected --{alone[0]} with --two-sided, got it alone; add --two-sided, or leave it out.")
@@ -142,7 +142,7 @@ def tube(
 
 
 @app.command()
-@of_a_controller
+@with_controller_options
 def check(
     proof: Annotated[Path, typer.Argument(help="The file of --keep.", metavar="PROOF")],
     given: Given,
@@ -155,14 +155,14 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Whether a kept proof proves its claim: its leaves are bounded anew, without a search."""
+    """Check a kept proof: its boxes are bounded anew, without a search."""
     from lyapnet.claims.checking import check as checked
     from lyapnet.claims.checking import labels_of
     from lyapnet.claims.tables import progress_reporter, rows_of, table_of
 
     given = given.with_functions(value, law)
     controller = given.load()
-    computed = None if file is None else law_of(controller, file, given)
+    computed = None if file is None else load_exported_law(controller, file, given)
     result = checked(controller, proof, workers, progress_reporter(given.report, "check"), computed)
     given.report.rest()
     if as_json:
@@ -174,7 +174,7 @@ def check(
 
 
 def _draw(given: Given, claim: Sampled | Statistical, output: Output) -> None:
-    """A claim from sampled states, whose draw is taken down, or which says why that is not possible."""
+    """Establish a claim from sampled states, and record the draw, or say why that is not possible."""
     from lyapnet.claims.certify import certify
     from lyapnet.claims.draws import draws_of
 
@@ -191,7 +191,7 @@ def _draw(given: Given, claim: Sampled | Statistical, output: Output) -> None:
 
 
 def _prove(given: Given, claims: Sequence[Claim], search: Search, refining: Refining, output: Output) -> None:
-    """A claim, or both sides of one, proved; after rounds of training, where these are asked for."""
+    """Prove a claim, or both sides of one; with --refine after rounds of training."""
     begun = time.monotonic()
     from lyapnet.claims.certify import certify
 
@@ -199,7 +199,7 @@ def _prove(given: Given, claims: Sequence[Claim], search: Search, refining: Refi
     output.require_writable(refining.keep)
     progress = _progress(given, claims)
 
-    def certified(checkpoint: Path, started: float | None = None) -> Any:
+    def prove(checkpoint: Path, started: float | None = None) -> Any:
         started, found = started or time.monotonic(), given.of(checkpoint)
         controller = found.load()
         made = [_with_law(each, controller, found) for each in claims]
@@ -210,26 +210,26 @@ def _prove(given: Given, claims: Sequence[Claim], search: Search, refining: Refi
         return certificate
 
     if not refining.refine:
-        return output.write(certified(given.checkpoint, begun), given)
+        return output.write(prove(given.checkpoint, begun), given)
     from lyapnet.training.refinement import refine
 
     notes = Console(stderr=True, highlight=False, markup=False)
     checkpoint, certificate = refine(
-        given.checkpoint, certified, refining.refine, refining.overrides or [], notes, given.parts()
+        given.checkpoint, prove, refining.refine, refining.overrides or [], notes, given.parts()
     )
     return output.write(certificate, given.of(checkpoint))
 
 
 def _with_law(claim: Claim, controller: Any, given: Given) -> Claim:
-    """A claim with the law that its file computes, in the place of the file."""
+    """The claim with the law that its file computes instead of the file."""
     file = getattr(claim, "file", None)
-    return claim if file is None else replace(claim, file=law_of(controller, file, given))  # pyright: ignore
+    return claim if file is None else replace(claim, file=load_exported_law(controller, file, given))  # pyright: ignore
 
 
 def _prove_for_each(
     given: Given, claim: Region, state: str, pushes: Sequence[float], search: Search, output: Output
 ) -> None:
-    """A region for each largest push on one state, each within seconds of its own: a table or JSON, and a figure."""
+    """Prove a region for each disturbance of one state, each within --seconds; print a table or JSON, and draw them."""
     from lyapnet.claims.certify import certify
     from lyapnet.claims.disturbances.regions import DisturbedRegions
     from lyapnet.claims.disturbances.tables import table
@@ -250,11 +250,11 @@ def _prove_for_each(
         Console(highlight=False, markup=False).print(table(given.title, regions))
     if output.figure is not None:
         write_figure(regions.figure(), output.figure)
-        note_written(output.figure)
+        print_written(output.figure)
 
 
 def _progress(given: Given, claims: Sequence[Claim]) -> Callable[[Any], None]:
-    """What tells how far a proof is."""
+    """A function that reports the progress of a proof."""
     from lyapnet.claims.tables import progress_reporter
 
     return progress_reporter(given.report, ("two-sided " if len(claims) > 1 else "") + claims[0].kind)

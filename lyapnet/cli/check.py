@@ -18,8 +18,8 @@ from rich.text import Text
 from lyapnet.base.errors import Interrupted, signals_taken
 from lyapnet.cli.options import Debug
 
-NAMES = 14  # columns for the names of facts
-WIDEST = 120
+NAMES = 14  # width of the column of names, in characters
+WIDEST = 120  # largest width of the output, in characters
 # names of facts in the order in which they become known
 ORDER = ("horizon", "X₀", "system", "goal", "modes", "controllable", "step gain", "start")
 
@@ -30,9 +30,9 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Say what can be said of a task before training it: its goal, its modes, how stiff it is, and where to start.
+    """Print facts about a task before training: its goal, its modes, how stiff it is, and how to start.
 
-    Each fact is printed as soon as it is known; after Ctrl-C those that are known stay.
+    Each fact is printed as soon as it is known, so that Ctrl-C loses none of them.
     """
     from lyapnet.training.stage_messages import StageMessages
 
@@ -45,8 +45,8 @@ def check(
         stops.append(Interrupted(signal.Signals(number).name, 130))
         raise stops[-1]
 
-    def known(fact: Any) -> None:
-        if stops:  # a module that was being imported kept it to itself
+    def add_fact(fact: Any) -> None:
+        if stops:  # a module that was being imported caught the exception
             raise stops[-1]
         facts.append(fact)
         if not as_json:
@@ -58,16 +58,16 @@ def check(
     try:
         with signals_taken(stop), stages:
             stages("reading the task")
-            experiment = _tell_what_is_written(config, overrides or [], known)
-            _find_facts(config, overrides or [], stages, known)
+            experiment = _report_config_facts(config, overrides or [], add_fact)
+            _report_task_facts(config, overrides or [], stages, add_fact)
     except BaseException as error:
         if not stops and not isinstance(error, Interrupted):
             raise
         if as_json:
-            _print_json(experiment, facts, _not_reached(facts))
+            _print_json(experiment, facts, _find_missing_facts(facts))
         seconds = time.monotonic() - began
         raise Interrupted(
-            f"Stopped after {seconds:.1f} s ({stages.now}); not reached: {', '.join(_not_reached(facts))}.", 130
+            f"Stopped after {seconds:.1f} s ({stages.now}); not reached: {', '.join(_find_missing_facts(facts))}.", 130
         ) from error
     if as_json:
         _print_json(experiment, facts, [])
@@ -76,20 +76,20 @@ def check(
     output.print(f"{'train':{NAMES}}{command}", soft_wrap=True)
 
 
-def _tell_what_is_written(config: Path, overrides: list[str], known: Any) -> str:
-    """Tell the facts that need no torch; the name of the experiment."""
+def _report_config_facts(config: Path, overrides: list[str], add_fact: Any) -> str:
+    """Report the facts that need no torch; return the name of the experiment."""
     from lyapnet.experiment.config import outline
     from lyapnet.training.config_facts import facts_of_config
 
     written = outline(config, overrides)
     for fact in facts_of_config(written):
-        known(fact)
+        add_fact(fact)
     return written.experiment
 
 
-def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> None:
-    """Tell the facts of the problem and of its start."""
-    gc.disable()  # of what is imported now nothing is garbage, and looking for it takes a seventh of the time
+def _report_task_facts(config: Path, overrides: list[str], report: Any, add_fact: Any) -> None:
+    """Report the facts of the problem and of its start."""
+    gc.disable()  # imports leave no garbage, and the search for it takes a seventh of their time
     try:
         from lyapnet.base.threads import use_threads
         from lyapnet.experiment.assembly import default_of, parts_of
@@ -103,11 +103,11 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     parts = parts_of(resolved)
     with default_of(resolved):
         learner = build_learner(resolved, build_problem_to_train(resolved, parts), parts)
-        facts_of(learner, report, known, resolved.rollout.choose_policy, resolved.outputs)
+        facts_of(learner, report, add_fact, resolved.rollout.choose_policy, resolved.outputs)
 
 
 def print_fact(console: Console, fact: Any) -> None:
-    """A fact in two columns, its name and what was found, with what to do about it below."""
+    """Print a fact in two columns, its name and what was found, with the advice below."""
     width = max(40, min(console.width, WIDEST)) - NAMES
     name, lines = fact.name, textwrap.wrap(fact.found, width, break_on_hyphens=False)
     if fact.advice:
@@ -117,8 +117,8 @@ def print_fact(console: Console, fact: Any) -> None:
         name = ""
 
 
-def _not_reached(facts: list[Any]) -> list[str]:
-    """The names of the facts that come after the last one that is known."""
+def _find_missing_facts(facts: list[Any]) -> list[str]:
+    """The names of the facts after the last known one."""
     from lyapnet.training.config_facts import OBSERVABLE, OUTPUTS
 
     last = max((ORDER.index(fact.name) for fact in facts if fact.name in ORDER), default=-1)

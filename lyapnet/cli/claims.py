@@ -1,4 +1,4 @@
-"""Options that several commands that certify share, beside those of each claim."""
+"""Options that several kinds of `lyapnet certify` share."""
 
 import json
 import math
@@ -12,27 +12,27 @@ from rich.console import Console
 from lyapnet.base.errors import UsageError
 from lyapnet.base.sizes import THREADS
 from lyapnet.claims.claim import option
-from lyapnet.cli.options import Given, read_pushes
+from lyapnet.cli.options import Given, read_numbers
 
 TwoSided = Annotated[bool, typer.Option("--two-sided", help="Bound the optimum from below, too.")]
 Value = Annotated[
     Path | None,
-    typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
+    typer.Option(help="ONNX file of another program's V(x); CKPT is then a config with its task.", metavar="FILE"),
 ]
 Law = Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")]
-Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
-Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
+Keep = Annotated[str | None, typer.Option(help="Keep the proof in this file, and continue from it.", metavar="FILE")]
+Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Number of processes that bound boxes.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """How long a proof is sought, and by how many."""
+    """The time limit of a proof, and its number of processes."""
 
-    seconds: float = option(60.0, "When to stop undecided.", above=0, remedy="a proof needs some")
+    seconds: float = option(60.0, "Time limit of the search.", above=0, remedy="a proof needs some")
     workers: Workers = 1
 
     def budget(self, started: float) -> Any:
-        """The same for a claim; its seconds count from when the command began."""
+        """The budget of a claim; its seconds count from the start of the command."""
         from lyapnet.prover.branch_and_bound import Budget
 
         return Budget(**vars(self), started=started)
@@ -40,7 +40,7 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchAnywhere(Search):
-    """And where."""
+    """Also the device and the cluster of the search."""
 
     ray: Annotated[
         str | None,
@@ -53,18 +53,18 @@ class SearchAnywhere(Search):
 
 @dataclass(frozen=True, kw_only=True)
 class Refining:
-    """Whether a proof is kept, or what failed is trained on with: not both."""
+    """Whether a proof is kept, or training continues with counterexamples; one of the two."""
 
     overrides: Annotated[
         list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
     ] = None
     keep: Keep = None
     refine: Annotated[
-        int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
+        int, typer.Option(min=0, help="Largest number of rounds of training with counterexamples.", metavar="ROUNDS")
     ] = 0
 
     def require_fitting(self, given: Given) -> None:
-        """Refuse what does not go with --refine, and overrides without it."""
+        """Refuse options that exclude --refine, and overrides without it."""
         if self.refine and self.keep is not None:
             raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
         if self.refine and given.at:
@@ -75,7 +75,7 @@ class Refining:
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """The draw, and how its certificate is shown."""
+    """The seed, and the outputs of a certificate."""
 
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False
@@ -85,21 +85,21 @@ class Output:
     ] = None
 
     def require_writable(self, keep: str | None = None) -> None:
-        """Refuse at once what could not be written after the work."""
+        """Refuse files that could not be written, before the work."""
         from lyapnet.claims.report import require_writable
 
         require_writable(self.figure, self.report, keep)
 
     def show(self, certificate: Any, given: Given) -> None:
-        """The certificate as a table, unless JSON is asked for."""
+        """Print the certificate as a table, unless --json is given."""
         given.report("comparing with the optimum")
-        certificate.result  # noqa: B018  # computed now, where it is told
+        certificate.result  # noqa: B018  # computed here, under this message
         given.report.rest()
         if not self.as_json:
             Console(highlight=False, markup=False).print(certificate.table(given.title))
 
     def write(self, certificate: Any, given: Given) -> None:
-        """The certificate as JSON, and its figure and report, where they are asked for."""
+        """Print the certificate as JSON, and write its figure and report, as far as options ask for them."""
         from lyapnet.claims.report import write_outputs
 
         if self.as_json:
@@ -109,35 +109,35 @@ class Output:
             given.report("drawing and writing")
         for path in write_outputs(certificate, given.checkpoint, command, self.figure, self.report):
             given.report.rest()
-            note_written(path)
+            print_written(path)
 
 
-def law_of(controller: Any, folder: Path, given: Given) -> Any:
-    """The law that an export in C computes, for claims about it; the export has to be that of the controller."""
+def load_exported_law(controller: Any, folder: Path, given: Given) -> Any:
+    """The law that an export in C computes, for claims about it; it has to be an export of the controller."""
     from lyapnet.exchange.export.certified import CertifiedFiles
 
     given.report("comparing the C with the checkpoint")
     return CertifiedFiles(controller, folder, given.checkpoint).law()
 
 
-def note_written(path: Path) -> None:
-    """Say on stderr that a file was written."""
+def print_written(path: Path) -> None:
+    """Print on stderr that a file was written."""
     Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)
 
 
-def pushes_of_one_state(named: list[str]) -> tuple[str, list[float]]:
-    """The state and the pushes that ["velocity=0,0.05,0.1"] names, in increasing order, each once.
+def read_disturbances_of_one_state(named: list[str]) -> tuple[str, list[float]]:
+    """Read ["velocity=0,0.05,0.1"]: the state, and the largest disturbances in increasing order, without repetition.
 
     Raises:
-        UsageError: more than one state is pushed, or what is named is no number ≥ 0.
+        UsageError: more than one state, or something else than numbers ≥ 0.
     """
     if len(named) != 1:
         raise UsageError(
-            f"Expected one --disturbance STATE=W,W,… where it has several values, got {len(named)} of them; push one "
+            f"Expected a single --disturbance if it has several values, as STATE=W,W,…, got {len(named)}; name one "
             "state."
         )
     state, _, values = named[0].partition("=")
-    pushes = {read_pushes([f"{state}={value}"])[state] for value in values.split(",")}
+    pushes = {read_numbers([f"{state}={value}"])[state] for value in values.split(",")}
     wrong = [w for w in pushes if not 0 <= w < math.inf]
     if wrong:
         raise UsageError(f"Expected disturbances ≥ 0, got {wrong[0]:g}; give the largest |w| in units of ẋ.")

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.sizes import THREADS
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 from lyapnet.training.stage_messages import StageMessages, silent
 
 
@@ -37,8 +37,8 @@ def compare(
 ) -> None:
     """Compare lyapnet with PPO, SAC, LQR, iLQR and MPC: same tasks and states.
 
-    What is finished is taken as it is, and what was stopped goes on: the same
-    command again only fills in what is missing, and writes the report anew.
+    The same command again runs only the jobs that are missing, continues those
+    that were stopped, and writes the report anew.
 
     lyapnet compare --config conf/compare.yaml --workers 2
     lyapnet compare --config conf/compare.yaml --tasks reacher --methods lyapnet,ppo_tuned --seeds 1
@@ -47,7 +47,7 @@ def compare(
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/compare.yaml.")
     console = Console(highlight=False, markup=False)
-    with stages_of("compare") as stages:
+    with make_stages("compare") as stages:
         stages(f"importing torch and Lightning for {config}")
         from lyapnet.lab.comparison.execution import require_same, run_job
         from lyapnet.lab.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
@@ -61,8 +61,8 @@ def compare(
     for one in begun_jobs(comparison):
         require_same(one)
     missing = [] if report else [one for one in jobs if not one.finished]
-    tell_of_missing_optima(missing, console)
-    with stages_of("compare") as stages:
+    print_missing_optima(missing, console)
+    with make_stages("compare") as stages:
         failed = _run(missing, len(jobs), workers or os.cpu_count() or 1, ray, console, stages)
         _report(comparison, jobs, command, console, stages)
     if failed:
@@ -79,8 +79,8 @@ def _names(listed: str | None) -> list[str] | None:
     return None if listed is None else [name.strip() for name in listed.split(",") if name.strip()]
 
 
-def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
-    """A line for each task whose costs will stand alone, before hours are spent on it."""
+def print_missing_optima(jobs: Sequence[Any], console: Console) -> None:
+    """Print a line for each task without an optimum to compare with, before its jobs run for hours."""
     from lyapnet.lab.comparison.scoring import why_no_optimum
 
     for job in {job.task: job for job in jobs}.values():
@@ -91,7 +91,7 @@ def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
 def _run(
     jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console, stages: StageMessages
 ) -> int:
-    """Run the jobs, with a line for each that ends, and in a log one for what runs; how many failed."""
+    """Run the jobs and show their progress; return how many failed."""
     from lyapnet.lab.comparison.progress import progress
     from lyapnet.lab.comparison.workers import run_jobs
 
@@ -109,7 +109,7 @@ def _run(
 def _report(
     config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console, stages: StageMessages
 ) -> None:
-    """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
+    """Write and print the report of all finished jobs, also of seeds beyond the number in the config."""
     from lyapnet.base.tables import terminal
     from lyapnet.lab.comparison.execution import controllers_of
     from lyapnet.lab.comparison.plan import begun_jobs, jobs_of

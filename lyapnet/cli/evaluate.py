@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, estimator_of, of_a_controller
+from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, add_estimator, with_controller_options
 
 if TYPE_CHECKING:
     from lyapnet.controller.controller import Controller
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lyapnet.evaluation.measurement import Evaluation
 
 
-@of_a_controller
+@with_controller_options
 def evaluate(
     given: Given,
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 256,
@@ -32,22 +32,20 @@ def evaluate(
     ] = False,
     until: Annotated[
         float | None,
-        typer.Option(help="Also where each law that can follow T leads, up to this many T.", metavar="MULTIPLE"),
+        typer.Option(help="Also under each law that can follow T, up to this multiple of T.", metavar="MULTIPLE"),
     ] = None,
     plant: Annotated[
         Path | None,
-        typer.Option(help="Also in MuJoCo's simulator, on the plant of this MJCF or URDF file.", metavar="FILE.xml"),
+        typer.Option(help="Also in MuJoCo's simulator, with the plant of this MJCF or URDF file.", metavar="FILE.xml"),
     ] = None,
     animation: Annotated[
         Path | None,
         typer.Option(help="With --plant: the first of these closed loops as MuJoCo draws it.", metavar="FILE.gif"),
     ] = None,
-    paths: Annotated[
-        int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
-    ] = 32,
+    paths: Annotated[int, typer.Option(min=2, help="Paths of the noise from each state, if the task has noise.")] = 32,
     outputs: Measured = None,
     estimator: Annotated[
-        str, typer.Option(help="The estimator, where outputs are measured: ekf or ukf, Kalman filters.")
+        str, typer.Option(help="The estimator, if outputs are measured: ekf or ukf, Kalman filters.")
     ] = "ekf",
     deviation: FirstDeviation = None,
     delay: Delay = None,
@@ -55,8 +53,8 @@ def evaluate(
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
 
-    The optimum of a linear task is Riccati's; that of any other takes CasADi, the extra oracle, and is computed
-    once for each state: the next evaluation of any controller of the task reads it.
+    The optimum of a linear task follows from the Riccati equation; that of any other needs CasADi, the extra oracle.
+    Optima are computed once for each state and kept for later evaluations of the task.
     """
     from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
     from lyapnet.evaluation.in_simulator import read_plant, simulate
@@ -76,7 +74,7 @@ def evaluate(
         if plant is None:
             raise UsageError("Expected --plant with --animation, got none; without a plant write lyapnet animate.")
     controller = given.load()
-    filtered = estimator_of(controller, outputs or [], estimator, deviation, delay)
+    filtered = add_estimator(controller, outputs or [], estimator, deviation, delay)
     count = min(samples, 64)
     simulated = None if plant is None else read_plant(plant, controller, animation is not None)
     renderer = None if simulated is None or animation is None else renderer_of(simulated)
@@ -123,7 +121,7 @@ def evaluate(
 
 
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int, plant: str) -> None:
-    """What was asked for besides, from `count` states."""
+    """Print the tables of further measurements, from `count` states."""
     from lyapnet.evaluation.robustness import nominal
     from lyapnet.evaluation.tables import after_horizon_table, robustness_table, simulator_table
 
@@ -144,7 +142,7 @@ def _write_figures(
     later: "list[LoopsAfterHorizon]",
     estimator: "OutputFeedback | None",
 ) -> str:
-    """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
+    """Draw closed loops, V, and cost and V(0, x₀) against the optimum if known; return a sentence about the files."""
     from lyapnet.evaluation import figures
     from lyapnet.evaluation.after_horizon_figure import distances
     from lyapnet.evaluation.estimator_figure import states_and_estimates
@@ -176,5 +174,5 @@ def _write_figures(
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=150)
-    missing = "" if "optimality" in drawn else "; no optimality.png, for want of an optimum to draw against"
+    missing = "" if "optimality" in drawn else "; no optimality.png, because the optimum is not known"
     return f"wrote {', '.join(f'{name}.png' for name in drawn)} into {folder}{missing}"

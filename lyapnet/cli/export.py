@@ -7,23 +7,24 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, estimator_of, of_a_controller
+from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, add_estimator, with_controller_options
 
 
-@of_a_controller
+@with_controller_options
 def export(
     given: Given,
     to: Annotated[str, typer.Option(help="c, fmu, onnx, torch or casadi.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
-    name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
+    name: Annotated[str, typer.Option(help="Prefix of names in C.")] = "lyapnet",
     beyond: Annotated[
-        str | None, typer.Option(help="The law after T: hold, receding or riccati; else that which holds the goal.")
+        str | None,
+        typer.Option(help="The law after T: hold, receding or riccati; by default the one that keeps the goal."),
     ] = None,
-    dtype: Annotated[str, typer.Option(help="Of the numbers in C: float64 or float32.")] = "float64",
-    fmi: Annotated[str, typer.Option(help="The interface of an fmu: 2.0 or 3.0.")] = "2.0",
+    dtype: Annotated[str, typer.Option(help="Type of numbers in C: float64 or float32.")] = "float64",
+    fmi: Annotated[str, typer.Option(help="FMI version of an fmu: 2.0 or 3.0.")] = "2.0",
     estimator: Annotated[
         str | None,
-        typer.Option(help="In C and fmu, also the loop with an estimator of states that are not measured: ekf."),
+        typer.Option(help="For c and fmu, also the loop with an estimator of the state from readings: ekf."),
     ] = None,
     outputs: Measured = None,
     deviation: FirstDeviation = None,
@@ -31,12 +32,12 @@ def export(
     certified: Annotated[
         Path | None,
         typer.Option(
-            help="To c: check this proof about the files, and write its claim into the header.", metavar="PROOF"
+            help="For c: check this proof about the files, and write its claim into the header.", metavar="PROOF"
         ),
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
+    """Write the control law for use without lyapnet, and compare it with the controller at 10 000 states.
 
     c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. fmu is a unit for
     co-simulation with that C inside. onnx is a model (t, x) ↦ (u, V) of one state, with p beside x for a family; torch
@@ -56,7 +57,7 @@ def export(
     controller = given.load() if beyond is None else given.load().continued(beyond)
     exported = controller
     if estimator is not None:
-        exported = estimator_of(controller, outputs or [], estimator, deviation, delay)
+        exported = add_estimator(controller, outputs or [], estimator, deviation, delay)
         if exported is None:
             raise UsageError("Expected --outputs, or outputs in the run's YAML, with --estimator, got none; name them.")
     given.report("writing and verifying")
@@ -78,7 +79,7 @@ def export(
 
 
 def _write_claim(controller: Any, folder: Path, proof: Path, given: Given) -> str:
-    """Check a proof about exported files, and write its claim into their header; what was done, in words."""
+    """Check a proof about exported files, and write its claim into their header; return a sentence about it."""
     from lyapnet.claims.checking import check, claim_text
     from lyapnet.exchange.export.certified import CertifiedFiles
 

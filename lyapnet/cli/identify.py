@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import UsageError
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
 
 def identify(
@@ -30,7 +30,8 @@ def identify(
     ] = None,
     family: Annotated[bool, typer.Option("--family", help="Write the ranges as family instead of randomise.")] = False,
     with_residual: Annotated[
-        bool, typer.Option("--residual", help="Also fit r(x), effects that the equations lack; add it if needed.")
+        bool,
+        typer.Option("--residual", help="Also fit r(x), the effects that the equations lack; it is added if it helps."),
     ] = False,
     out: Annotated[
         Path | None,
@@ -52,12 +53,12 @@ def identify(
     files = [Path(each) for each in data if each not in overrides]
     target = config.with_name(f"{config.stem}_identified.yaml") if out is None else out
     if not files:
-        raise UsageError("Expected CSV files of measurements behind the config, got none; name one or more.")
+        raise UsageError("Expected CSV files of measurements after the config, got none; name one or more.")
     if target.suffix not in (".yaml", ".yml") or not target.parent.is_dir() or target.resolve() == config.resolve():
         raise UsageError(
             f"Expected --out as another YAML file in a folder that exists, got {str(target)!r}; choose such a name."
         )
-    with stages_of("identify") as report:
+    with make_stages("identify") as report:
         report("importing torch")
         from lyapnet.base.files import write_atomically
         from lyapnet.base.threads import use_threads

@@ -1,4 +1,4 @@
-"""What several commands share: options, and the controller that a command is given."""
+"""Options that several commands share, and the controller that a command is given."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims.claim import check_number, flag_of, kind_of_number
 from lyapnet.training.stage_messages import PATIENCE, StageMessages
 
-FIRST = 1.0  # seconds after which a command says what it is doing
+FIRST = 1.0  # seconds after which a command first reports its stage
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
@@ -26,13 +26,13 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an e
 Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run, or zoo:NAME.", metavar="CKPT")]
 At = Annotated[
     list[str] | None,
-    typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
+    typer.Option(help="A member of a family: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
 ]
 Measured = Annotated[
     list[str] | None,
     typer.Option(
         "--outputs",
-        help="With an estimator: a measured state and its noise; of the system's output(x), only the noise.",
+        help="With an estimator: a measured state and its noise; only the noise for the system's output(x).",
         metavar="STATE=SIGMA",
     ),
 ]
@@ -59,17 +59,17 @@ OWN = {
 
 @dataclass(frozen=True)
 class Given:
-    """The controller that a command is given: its checkpoint, the user's own parts, and of a family one member."""
+    """The controller that a command is given: its checkpoint, the user's own parts, and the member of a family."""
 
     checkpoint: Path
     own: dict[str, str | None]  # the user's own parts, as module:Class, each by its option's name
     at: list[str] | None
-    report: StageMessages  # is told what is being done
-    functions: tuple[Path, Path] | None = None  # ONNX files of V and u made elsewhere; the checkpoint is a config then
+    report: StageMessages  # reports the stage of the command
+    functions: tuple[Path, Path] | None = None  # ONNX files of imported V and u; the checkpoint is then a config
 
     @property
     def title(self) -> str:
-        """What a table calls the controller."""
+        """The name of the controller in tables."""
         from lyapnet.experiment.checkpoint import ZOO
 
         name = f"zoo:{self.checkpoint.stem}" if self.checkpoint.parent == ZOO else str(self.checkpoint)
@@ -82,11 +82,11 @@ class Given:
 
     @property
     def again(self) -> dict[str, str | None]:
-        """The options that give the same controller again, but for --at."""
+        """The options that name the same controller in another command, without --at."""
         return {**self.own, **dict(zip(("value", "law"), map(str, self.functions or ()), strict=False))}
 
     def with_functions(self, value: Path | None, law: Path | None) -> "Given":
-        """The same with V and u of their own files, where there are both; a config in the place of a checkpoint."""
+        """The same with V and u from ONNX files, and a config in place of the checkpoint; both files or none."""
         if value is None and law is None:
             return self
         if value is None or law is None or self.at:
@@ -95,7 +95,7 @@ class Given:
         return replace(self, functions=(value, law))
 
     def of(self, checkpoint: Path) -> "Given":
-        """The same of another checkpoint."""
+        """The same with another checkpoint."""
         return replace(self, checkpoint=checkpoint)
 
     def parts(self) -> Any:
@@ -125,21 +125,21 @@ class Given:
             controller = imported_controller(self.checkpoint, *self.functions, self.named)
         use_threads(controller.config.training.threads)
         torch.set_default_dtype(DTYPES[controller.config.training.precision])  # until the command ends
-        return member_of(controller, self.at) if self.at else controller
+        return choose_member(controller, self.at) if self.at else controller
 
 
-def stages_of(name: str) -> StageMessages:
-    """What tells on stderr what a command is doing, from before torch is imported; what is quickly done is not told.
+def make_stages(name: str) -> StageMessages:
+    """Messages on stderr about the stages of a command; short stages are not reported.
 
-    It keeps to the stderr of the command, which an oracle hides from others while it searches.
+    They go to the stderr from before the command, which remains when an oracle redirects stderr during a search.
     """
     return StageMessages(Console(file=sys.stderr, highlight=False, markup=False), name, PATIENCE, FIRST)
 
 
-def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with a Given among its parameters, as one with CKPT in its place, --system and its like, and --at.
+def with_controller_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the parameter of type Given of a command by the options CKPT, --system and other parts, and --at.
 
-    A parameter of another dataclass stands for an option of each of its fields; see options_of.
+    A parameter that is another dataclass is replaced by an option for each field; see options_of.
     """
     parameters = list(inspect.signature(command).parameters.values())
     (given,) = (parameter.name for parameter in parameters if parameter.annotation is Given)
@@ -155,7 +155,7 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
         for name, (made, each) in groups.items():
             taken = {option.name: options.pop(option.name) for option in each}
             options[name] = made(**{name: _read(name, value) for name, value in taken.items()})
-        with stages_of(command.__name__) as report:
+        with make_stages(command.__name__) as report:
             report(f"importing torch for {checkpoint}")
             import torch
 
@@ -189,13 +189,13 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def options_of(cls: Any, written: Container[str] = ()) -> list[inspect.Parameter]:
-    """The options of the command line that the fields of a dataclass stand for.
+    """The options of the command line for the fields of a dataclass.
 
-    A field declared with lyapnet.claims.claim.option has its sentence, its rule and its name from there; any other says
-    itself what it is, as Annotated[…, typer.Option(…)].
+    A field declared with lyapnet.claims.claim.option has its help, its rule and its name from there; any other is
+    declared as Annotated[…, typer.Option(…)].
 
     Args:
-        written: parameters that a command has by itself, which stand for no field.
+        written: names of the command's other parameters; fields with these names are left out.
     """
     return [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, annotation=_annotation(f), default=f.default)
@@ -205,7 +205,7 @@ def options_of(cls: Any, written: Container[str] = ()) -> list[inspect.Parameter
 
 
 def _annotation(f: dataclasses.Field[Any]) -> Any:
-    """A field as an option of the command line, with its rule."""
+    """The type of a field as an option of the command line, with its rule."""
     if "doc" not in f.metadata:
         return f.type
     name, kind, rule = f"--{flag_of(f)}", kind_of_number(f), f.metadata
@@ -225,18 +225,18 @@ def _annotation(f: dataclasses.Field[Any]) -> Any:
 
 
 def _read(name: str, value: Any) -> Any:
-    """The value of a field from what its option was given."""
+    """Read the value of a field from that of its option."""
     return READ[name][1](value) if name in READ and value is not None else value
 
 
 def read_set(text: str, name: str = "set") -> list[list[float]]:
-    """[lower, upper] of "-1:1,-0.7:0.7": bounds of each state, in the order of the system.
+    """Read "-1:1,-0.7:0.7": [lower, upper], bounds of each state in the order of the system.
 
     Args:
         name: the name of the option in the message.
 
     Raises:
-        UsageError: there are none.
+        UsageError: these are no bounds.
     """
     try:
         lower, upper = zip(*((float(low), float(high)) for low, high in _pairs(text)), strict=True)
@@ -253,14 +253,14 @@ def _pairs(text: str) -> list[list[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
-def read_pushes(named: Sequence[str], option: str = "--disturbance STATE=W") -> dict[str, float]:
-    """The number of each state by its name, from "velocity=0.1": the largest push on its derivative, or another.
+def read_numbers(named: Sequence[str], option: str = "--disturbance STATE=W") -> dict[str, float]:
+    """Read ["velocity=0.1"]: a number for each state, such as the largest disturbance of its derivative.
 
     Args:
         option: the option and its placeholder in the message.
 
     Raises:
-        UsageError: no number, or a state stands there twice.
+        UsageError: no number, or a state that is named twice.
     """
     found = dict[str, float]()
     for text in named:
@@ -275,10 +275,10 @@ def read_pushes(named: Sequence[str], option: str = "--disturbance STATE=W") -> 
 
 
 def read_intervals(named: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """The ends of each parameter's interval, by its name, from "mass=0.9:1.1".
+    """Read ["mass=0.9:1.1"]: the ends of an interval for each parameter.
 
     Raises:
-        UsageError: what is named is no interval, or stands there twice.
+        UsageError: no interval, or a parameter that is named twice.
     """
     found = dict[str, tuple[float, float]]()
     for text in named:
@@ -297,16 +297,16 @@ def read_intervals(named: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 READ: dict[str, tuple[bool, Callable[[Any], Any]]] = {
     "states": (False, read_set), "target": (False, partial(read_set, name="target")),
-    "avoid": (True, lambda texts: [read_set(text, "avoid") for text in texts]), "disturbance": (True, read_pushes),
-    "noise": (True, partial(read_pushes, option="--noise STATE=SIGMA")), "parameters": (True, read_intervals),
-    "time": (False, str), "measured": (True, partial(read_pushes, option="--measured STATE=E")),
-    "quantised": (True, partial(read_pushes, option="--quantised CONTROL=STEP")), "file": (False, Path),
+    "avoid": (True, lambda texts: [read_set(text, "avoid") for text in texts]), "disturbance": (True, read_numbers),
+    "noise": (True, partial(read_numbers, option="--noise STATE=SIGMA")), "parameters": (True, read_intervals),
+    "time": (False, str), "measured": (True, partial(read_numbers, option="--measured STATE=E")),
+    "quantised": (True, partial(read_numbers, option="--quantised CONTROL=STEP")), "file": (False, Path),
 }  # fmt: skip
-"""A field that is no number ↦ whether its option may be given again, and how its text is read."""
+"""A field that is no number ↦ whether its option may be repeated, and the function that reads its text."""
 
 
-def member_of(controller: Any, at: list[str]) -> Any:
-    """The controller of one member of a family, from NAME=VALUE of its parameters."""
+def choose_member(controller: Any, at: list[str]) -> Any:
+    """The controller of a member of a family, from NAME=VALUE of its parameters."""
     try:
         parameters = {name: float(value) for name, _, value in (each.partition("=") for each in at)}
     except ValueError as error:
@@ -316,10 +316,10 @@ def member_of(controller: Any, at: list[str]) -> Any:
     return controller.with_(**parameters)
 
 
-def estimator_of(
+def add_estimator(
     controller: Any, outputs: list[str], kind: str, deviation: list[float] | None, delay: int | None
 ) -> Any:
-    """The controller with an estimator, of outputs that the command names, or else of its config; None without any."""
+    """The controller with an estimator, for the outputs of the command or else of the config; None without outputs."""
     if not outputs:
         if controller.measures_outputs:
             return controller.with_estimator(kind, initial_deviation=deviation or None, delay=delay)

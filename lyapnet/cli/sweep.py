@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import LyapnetError
 from lyapnet.base.sizes import THREADS
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
 
 def sweep(
@@ -27,14 +27,14 @@ def sweep(
 ) -> None:
     """Train several configs, or one with several values of a key, and compare.
 
-    What is trained already is taken as it is, and what was stopped goes on:
-    the same command again only fills in what is missing.
+    The same command again runs only the trainings that are missing, and continues
+    those that were stopped.
 
     lyapnet sweep --config conf/double_integrator.yaml --vary horizon.steps=100,200,300,400
     lyapnet sweep --config conf/reacher.yaml --config conf/cartpole_swingup.yaml seeds=5
     """
     console = Console(highlight=False, markup=False)
-    with stages_of("sweep") as report:
+    with make_stages("sweep") as report:
         report("importing torch and Lightning")
         from lyapnet.lab.sweep.points import points_of
         from lyapnet.lab.sweep.runs import sweep as run

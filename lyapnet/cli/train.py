@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.base.errors import Interrupted, UsageError
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
 
 def train(
@@ -27,11 +27,11 @@ def train(
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
     from lyapnet.experiment.config import load_config, outline
 
-    outline(config, overrides or [])  # what is misspelt is refused before torch is imported
+    outline(config, overrides or [])  # refuses misspelt keys before torch is imported
     console = Console(highlight=False, markup=False)
-    command = shlex.join([*_program(sys.argv[0]), "--config", str(config), *(overrides or [])])
+    command = shlex.join([*_find_command(sys.argv[0]), "--config", str(config), *(overrides or [])])
     try:
-        with stages_of("train") as report:
+        with make_stages("train") as report:
             report(f"importing torch and Lightning for {config}")
             from lyapnet.experiment.assembly import default_of  # takes seconds
             from lyapnet.training.experiment import fit
@@ -53,8 +53,8 @@ def train(
         _print_result(console, plan, result, command)
 
 
-def _program(script: str) -> list[str]:
-    """What was typed in the place of `lyapnet train`, from the name of the script that runs."""
+def _find_command(script: str) -> list[str]:
+    """The command that was typed instead of `lyapnet train`, from the name of the running script."""
     typed = {"train.py": ["python", script], "__main__.py": ["python", "-m", "lyapnet", "train"]}
     return typed.get(Path(script).name, ["lyapnet", "train"])
 
@@ -71,7 +71,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
     best, own = members[0].best, own_parts(plan.config)
     quoted = shlex.quote(str(best))
     options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
-    kind = _claim(plan.config) if plan.module.members[0].problem.has_goal else "tube"
+    kind = _choose_claim(plan.config) if plan.module.members[0].problem.has_goal else "tube"
     modules = ", ".join(["lyapnet", *dict.fromkeys(name.partition(":")[0] for name in own.values())])
     arguments = "".join(f", {part}={python_of(plan.config, part)}" for part in own)
     estimator = " --estimator ekf" if plan.config.outputs.noise is not None else ""
@@ -89,6 +89,6 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         console.print(f"{what:<10}{shown}", soft_wrap=True)
 
 
-def _claim(config: Any) -> str:
-    """The kind of claim that a training was made for: V that is trained on all of a set D as a bound can be proved."""
+def _choose_claim(config: Any) -> str:
+    """The kind of claim for a trained V: sound if it was trained as a bound on all of a set D, else statistical."""
     return "sound" if config.pointwise.region and config.program.name == "lyapunov" else "statistical"

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
 
 def trim(
@@ -31,7 +31,7 @@ def trim(
         raise UsageError(
             "Expected a target whose control is solved for, got target_control; add target_control=null to the command."
         )
-    with stages_of("trim") as report:
+    with make_stages("trim") as report:
         report("solving for the operating point")
         system, found = operating_point(resolved, parts_of(resolved))
     units = {
@@ -59,7 +59,7 @@ def _plain(point: Any, units: dict[str, dict[str, str]]) -> dict[str, Any]:
 
 
 def _table(title: str, points: list[Any], units: dict[str, dict[str, str]]) -> Table:
-    """A row for each state and control, and a column for each point; the first is the one that is taken."""
+    """A row for each state and control, and a column for each point; the first point is the target."""
     headers = ["operating point", *(f"another, {k}" for k in range(1, len(points)))]
     table = Table("", *headers, title=title)
     for side in ("states", "controls"):

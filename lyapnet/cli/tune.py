@@ -10,7 +10,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import Interrupted, LyapnetError, UsageError
 from lyapnet.base.sizes import THREADS
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
 
 def tune(
@@ -20,28 +20,28 @@ def tune(
     vary: Annotated[
         list[str] | None,
         typer.Option(
-            help="A key and its ends or its values, once or more; the standard ones if none.",
+            help="A key with its range or its values; may be repeated. Standard keys if none.",
             metavar="KEY=LOW..HIGH[:log]|VALUE,VALUE,…",
         ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, max=THREADS, help="Trainings at a time.")] = 1,
     out: Annotated[
-        Path | None, typer.Option(help="Everything goes there; LOGS/EXPERIMENT/tune if none.", metavar="FOLDER")
+        Path | None, typer.Option(help="Folder of the search; LOGS/EXPERIMENT/tune if none.", metavar="FOLDER")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of what is proposed.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the proposals.")] = 0,
     final: Annotated[bool, typer.Option(help="Train the best once more, with another seed, and evaluate it.")] = True,
     debug: Debug = False,
 ) -> None:
     """Search settings with which a config reaches a lower cost, by Optuna.
 
-    A search that was stopped goes on with the same command; more --trials extend it.
+    The same command continues a search that was stopped; a larger --trials extends it.
 
     lyapnet tune conf/pendulum_limited.yaml --trials 30 --workers 2
     lyapnet tune conf/reacher.yaml --vary training.learning_rate=1e-4..1e-2:log --vary training.batch_size=16,32,64
     """
     if importlib.util.find_spec("optuna") is None:
         raise UsageError('Expected Optuna for a search, got none; pip install "lyapnet[tune]".')
-    with stages_of("tune") as report:
+    with make_stages("tune") as report:
         report(f"importing torch and Lightning for {config}")
         from lyapnet.lab.tuning.search import best_of, open_study, search, task_of, train_anew
         from lyapnet.lab.tuning.tables import final_line
@@ -62,9 +62,7 @@ def tune(
             report.rest()
             _show(task, study)
             if (best := best_of(study)) is None:
-                raise LyapnetError(
-                    f"Expected a trial that comes to its end, got {trials} that do not; see {task.folder}."
-                )
+                raise LyapnetError(f"Expected a trial that finishes, got {trials} that did not; see {task.folder}.")
             if final:
                 report("final training")
                 training = train_anew(task, best, say)
@@ -73,7 +71,7 @@ def tune(
 
 
 def _show(task: Any, study: Any) -> None:
-    """Show the trials, and write them down."""
+    """Print the trials, and write them to files."""
     from lyapnet.lab.tuning.search import write_best
     from lyapnet.lab.tuning.tables import search_csv, search_rows, search_table, summary
 

@@ -6,21 +6,21 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.options import Debug, Given, with_controller_options
 
 
-@of_a_controller
+@with_controller_options
 def view(
     given: Given,
     out: Annotated[Path, typer.Option(help="The file: a .html.")],
     proof: Annotated[
-        Path | None, typer.Option(help="Draw the funnel that certify sound --keep FILE proved.", metavar="FILE")
+        Path | None, typer.Option(help="Draw the funnel of this proof by certify sound --keep FILE.", metavar="FILE")
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Write an interactive page: V and u on slices through time, the funnel, and closed loops from where you click.
+    """Write an interactive page: V and u on slices through time, the funnel, and closed loops from any state.
 
-    The page is one file that needs no server and no network.
+    The page is one file and needs no server and no network.
     """
     from lyapnet.claims.checking import kept_funnel
     from lyapnet.exchange.view import write_page

@@ -8,29 +8,33 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from lyapnet.cli.options import Debug, stages_of
+from lyapnet.cli.options import Debug, make_stages
 
-LEAST_SHOWN = 1e-12  # of a distance to the goal
-STATES = 1000  # that a demonstration draws for its certificate
+LEAST_SHOWN = 1e-12  # smaller distances to the goal are printed as below this
+STATES = 1000  # number of states that a demonstration draws for its certificate
 
 
 def zoo(
-    exports: Annotated[bool, typer.Option("--exports", help="How far each export is from its controller.")] = False,
-    after: Annotated[bool, typer.Option("--after", help="What follows T, and how near the goal it stays.")] = False,
+    exports: Annotated[
+        bool, typer.Option("--exports", help="Show the difference of each export from its controller.")
+    ] = False,
+    after: Annotated[
+        bool, typer.Option("--after", help="Show the law after T, and how near the goal it stays.")
+    ] = False,
     debug: Debug = False,
 ) -> None:
-    """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
-    with stages_of("zoo") as report:
+    """List the controllers that come with lyapnet, which any command takes as zoo:NAME in place of a checkpoint."""
+    with make_stages("zoo") as report:
         report("importing torch")
         from lyapnet.claims.tables import floored
         from lyapnet.zoo import entries
 
     console = Console(highlight=False, markup=False)
     if exports:
-        console.print(_exports(entries()))
+        console.print(_tabulate_exports(entries()))
         return
     if after:
-        console.print(_after(entries()))
+        console.print(_tabulate_after_horizon(entries()))
         return
     table = Table(Column("zoo:", no_wrap=True), "cost / optimum", "worst state", "error of V", "certified share of X₀")
     table.title = "Controllers that come with lyapnet"
@@ -52,9 +56,9 @@ def demo(
     out: Annotated[Path | None, typer.Option(help="The folder; else lyapnet_demo/NAME.", metavar="FOLDER")] = None,
     debug: Debug = False,
 ) -> None:
-    """Show a controller that comes with lyapnet: against the optimum, certified, drawn and in motion; no training."""
+    """Show a controller of the zoo without training: its optimality, a certificate, figures and an animation."""
     began = time.monotonic()
-    with stages_of("demo") as report:
+    with make_stages("demo") as report:
         report(f"importing torch for {name}")
         from lyapnet.base.threads import use_threads
         from lyapnet.claims.certify import certify
@@ -84,7 +88,7 @@ def demo(
         trajectories(shown, controller.problem).savefig(folder / "trajectories.png", dpi=150)
         Film(shown, controller.problem, controller.value).write(folder / "closed_loops.gif")
     console = Console(highlight=False, markup=False)
-    console.print(_table(one.name, trajectory.x.shape[1], measured, certificate))
+    console.print(_tabulate_measures(one.name, trajectory.x.shape[1], measured, certificate))
     console.print(f"{'made by':<10}{one.record['command']}", soft_wrap=True)
     console.print(f"{'wrote':<10}{folder / 'trajectories.png'}, {folder / 'closed_loops.gif'}", soft_wrap=True)
     for what, command in (
@@ -97,7 +101,7 @@ def demo(
     console.print(f"{time.monotonic() - began:.1f} s")
 
 
-def _exports(found: list[Any]) -> Table:
+def _tabulate_exports(found: list[Any]) -> Table:
     formats = {to: None for one in found for precision in one.record["export"].values() for to in precision}
     table = Table(Column("zoo:", no_wrap=True), "precision", *formats, title="Exports against their controllers")
     for one in found:
@@ -108,8 +112,8 @@ def _exports(found: list[Any]) -> Table:
     return table
 
 
-def _after(found: list[Any]) -> Table:
-    """The law after T of each, how many closed loops it holds, and how far from the goal they are."""
+def _tabulate_after_horizon(found: list[Any]) -> Table:
+    """A table of the laws after T: how many closed loops each keeps, and how far from the goal."""
     from lyapnet.value.after_horizon import HELD
 
     multiples = list(found[0].record["afterwards"]["distance"])
@@ -126,7 +130,7 @@ def _after(found: list[Any]) -> Table:
     return table
 
 
-def _table(name: str, states: int, measured: dict[str, str], certificate: Any) -> Table:
+def _tabulate_measures(name: str, states: int, measured: dict[str, str], certificate: Any) -> Table:
     from lyapnet.claims.tables import floored
 
     table = Table("measure", "value", title=f"zoo:{name}, {states} states of X₀ that no training saw")

@@ -19,7 +19,7 @@ from lyapnet.claims.receding_decrease import RecedingDecrease
 from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.cli import main
-from lyapnet.cli.claims import pushes_of_one_state
+from lyapnet.cli.claims import read_disturbances_of_one_state
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
 from lyapnet.prover.branch_and_bound import Budget
@@ -388,15 +388,15 @@ def test_for_each_size_there_is_a_claim():
 
 
 def test_pushes_of_several_sizes_are_of_one_state():
-    assert pushes_of_one_state(["velocity=0.2,0.4,0,30,0.2"]) == ("velocity", [0, 0.2, 0.4, 30])
+    assert read_disturbances_of_one_state(["velocity=0.2,0.4,0,30,0.2"]) == ("velocity", [0, 0.2, 0.4, 30])
     for named, expected in (
-        (["velocity=0,1", "position=1"], "Expected one --disturbance STATE=W,W,… .* got 2 of them"),
+        (["velocity=0,1", "position=1"], "Expected a single --disturbance .* got 2"),
         (["velocity=0,a"], "with a number"),
         (["velocity=0,"], "with a number"),
         (["velocity=0,-1"], "Expected disturbances ≥ 0"),
     ):
         with pytest.raises(UsageError, match=expected):
-            pushes_of_one_state(named)
+            read_disturbances_of_one_state(named)
 
 
 def test_another_state_than_those_of_the_system_is_refused():

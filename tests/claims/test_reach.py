@@ -19,7 +19,7 @@ from lyapnet.claims import reach_decrease
 from lyapnet.claims.arguments import with_noise
 from lyapnet.claims.checking import check
 from lyapnet.claims.reach import prove_reach
-from lyapnet.cli.options import read_pushes
+from lyapnet.cli.options import read_numbers
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget
@@ -292,7 +292,7 @@ def test_what_cannot_be_claimed_is_refused():
     with pytest.raises(UsageError, match="a target with an interior"):
         prove(target=Box([0.0, -1.0], [0.0, 1.0]))
     with pytest.raises(UsageError, match="Expected --noise STATE=SIGMA once for each state, got velocity twice"):
-        read_pushes(["velocity=0.1", "velocity=0.2"], option="--noise STATE=SIGMA")
+        read_numbers(["velocity=0.1", "velocity=0.2"], option="--noise STATE=SIGMA")
     with pytest.raises(UsageError, match="boxes of 2 states"):
         prove(avoided=[Box([0.0], [1.0])])
     with pytest.raises(UsageError, match="two derivatives in x"):

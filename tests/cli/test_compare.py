@@ -15,7 +15,7 @@ from rich.console import Console
 import lyapnet
 from lyapnet.base.errors import OracleError
 from lyapnet.cli import main
-from lyapnet.cli.compare import tell_of_missing_optima
+from lyapnet.cli.compare import print_missing_optima
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.lab.comparison.plan import jobs_of, load_comparison
 from lyapnet.lab.comparison.results import LEARNED, OURS, Result, with_common_optima
@@ -211,14 +211,14 @@ def test_a_killed_comparison_goes_on(killed, length, tmp_path):
 @pytest.mark.gate
 def test_costs_without_their_optimum_are_told_before_anything_is_trained(monkeypatch, capsys):
     jobs = jobs_of(load_comparison(SMOKE), ["reacher", "double_integrator"], ["ppo_tuned"])
-    tell_of_missing_optima(jobs, Console())
+    print_missing_optima(jobs, Console())
     assert not capsys.readouterr().out
 
     def none(*_):
         raise OracleError("Expected an oracle.")
 
     monkeypatch.setattr("lyapnet.lab.comparison.scoring.oracle_of", none)
-    tell_of_missing_optima(jobs, Console())
+    print_missing_optima(jobs, Console())
     said = capsys.readouterr().out.splitlines()
     assert said == [
         f"{task}: cost without its optimum. Expected an oracle." for task in ("reacher", "double_integrator")

@@ -83,7 +83,7 @@ def test_ranges_that_a_config_cannot_have_are_left_out_and_told(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["pendulum.yaml", "horizon.steps=3"], "Expected CSV files of measurements behind the config, got none"),
+        (["pendulum.yaml", "horizon.steps=3"], "Expected CSV files of measurements after the config, got none"),
         (["pendulum.yaml", "none.csv"], "Expected a CSV file, got 'none.csv' (No such file or directory)"),
         (["pendulum.yaml", "one.csv", "--out", "pendulum.yaml"], "Expected --out as another YAML file"),
         (["pendulum.yaml", "one.csv", "--out", "found.png"], "Expected --out as another YAML file"),

@@ -15,7 +15,7 @@ from lyapnet.claims.certify import certify
 from lyapnet.claims.kinds import Funnel
 from lyapnet.claims.tables import progress_reporter
 from lyapnet.cli import main
-from lyapnet.cli.options import stages_of
+from lyapnet.cli.options import make_stages
 from lyapnet.controller.loading import load
 from lyapnet.training.plan import plan_run
 from tests.runs import tiny_checkpoint
@@ -56,7 +56,7 @@ def test_a_command_that_loads_slowly_says_so_and_its_result_stays(checkpoint, mo
 
 
 def test_it_is_said_while_an_oracle_hides_what_others_say(capsys, telling):
-    with stages_of("evaluate") as report, contextlib.redirect_stderr(io.StringIO()) as hidden:
+    with make_stages("evaluate") as report, contextlib.redirect_stderr(io.StringIO()) as hidden:
         report("optima of states", 3, 64)
         time.sleep(1.0)
     assert capsys.readouterr().err.startswith("evaluate: optima of states, 3 of 64")

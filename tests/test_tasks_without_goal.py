@@ -93,7 +93,7 @@ class Dips(Far):
 @pytest.mark.parametrize(
     ("cost", "reason"),
     [
-        (Far(), "φ is 0, of slope (-1), at the origin, which stands in for a target: nobody named one"),
+        (Far(), "φ is 0, of slope (-1), at the origin, the default, because no target is named"),
         (Far(10.0), "φ is 10, of slope (-1), at the origin"),
         (Named(), "φ is 0, of slope (-1), at the goal (1)"),
         (Dips(), "q is negative"),

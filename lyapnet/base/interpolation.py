@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 DEGREES = {"linear": 1, "cubic": 3}
 COUNTS = (1, 2, 3, 5, 9, 14, 25, 49)  # numbers of polynomials along a parameter that are tried
-ALONG_AXIS = 8  # random values of a parameter at which they are tested, besides the ends of its range
-ASIDE = 0.71  # share of their ranges at which other parameters are meanwhile: in the middle much may vanish
+ALONG_AXIS = 8  # random values of a parameter at which these are tested, besides the ends of its range
+ASIDE = 0.71  # place of the other parameters in their ranges meanwhile; in the middle many functions vanish
 
 
 class Table(nn.Module):
@@ -107,7 +107,7 @@ class ChebyshevProducts(Basis):
 
     Args:
         lower, upper: the range of each parameter, (k,).
-        counts: number of polynomials along each parameter, 1 for one of no extent.
+        counts: number of polynomials along each parameter; 1 if its range is a point.
     """
 
     center: Float[Tensor, " k"]
@@ -124,7 +124,7 @@ class ChebyshevProducts(Basis):
         return _products(self._along_axes(p))
 
     def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
-        """The gradient of Σ c_k function_k in p, by T_i' = i U_{i−1}; beyond its range that at the end of it."""
+        """The gradient of Σ c_k function_k in p, by T_i' = i U_{i−1}; beyond the range that at its end."""
         axes, columns = self._along_axes(p), []
         for k, (count, half) in enumerate(zip(self.counts, self.half_widths, strict=True)):
             s = self._scaled(p, k)
@@ -210,11 +210,11 @@ def fewest_products(
     tested: Float[Tensor, "b k"],
     most: int,
 ) -> ChebyshevProducts | None:
-    """Products of the least degree that is accurate, along each parameter alone and then together.
+    """Accurate products of the least degree, determined along each parameter alone and then tested together.
 
     Args:
-        accurate: products, and parameters between their nodes (b, k) ↦ whether they are accurate there.
-        tested: these parameters for all products together.
+        accurate: (products, parameters (b, k) between their nodes) ↦ whether the products are accurate there.
+        tested: the parameters at which the products are tested together.
         most: the largest number of products that is tried.
 
     Returns:
@@ -234,7 +234,7 @@ def fewest_products(
 
 
 def _count_along(axis: int, lower: Tensor, upper: Tensor, accurate: Callable[[ChebyshevProducts, Tensor], bool]) -> int:
-    """The number of polynomials that are accurate along a parameter, with the others off the middle."""
+    """The number of polynomials that are accurate along a parameter, with the other parameters at ASIDE."""
     width = float(upper[axis] - lower[axis])
     if width == 0:
         return 1

@@ -1,4 +1,4 @@
-"""Functions of tensors that can stay one operator in a trace, for a reader that has an instruction for them."""
+"""Functions of tensors that can be single operators in a trace, for programs that have an instruction for them."""
 
 import functools
 import inspect
@@ -21,10 +21,10 @@ WHOLE = set[Any]()
 
 @contextmanager
 def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
-    """Within it, each function of a reader is traced as one operator (on=True) or as it is written (default).
+    """A context in which each function of a reader is traced as one operator (on=True) or by its operations (default).
 
-    Those of the kernel for numbers are made by `operator`; those of bounds are lyapnet.prover.rounding.rounded and, of
-    minima, lyapnet.task.cost.minimum.traced_minimum.
+    The functions of the kernel for numbers are made by `operator`; those of bounds are lyapnet.prover.rounding.rounded
+    and lyapnet.task.cost.minimum.traced_minimum.
     """
     token = _READERS.set(_READERS.get() | {reader} if on else _READERS.get() - {reader})
     try:
@@ -34,12 +34,12 @@ def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
 
 
 def are_operators(reader: str = NUMBERS) -> bool:
-    """Whether the functions that a reader has are one operator each."""
+    """Whether each function of a reader is traced as one operator."""
     return reader in _READERS.get()
 
 
 def is_transformed(x: Tensor) -> bool:
-    """Whether a tensor is one of torch.func's, under vmap or grad."""
+    """Whether a tensor is wrapped by torch.func, under vmap or grad."""
     return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
 
 

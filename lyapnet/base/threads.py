@@ -1,4 +1,4 @@
-"""Work that is divided over threads, and the seconds that it takes."""
+"""Division of work over threads, and its CPU seconds."""
 
 import functools
 import os
@@ -12,15 +12,15 @@ import torch
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
-CORES = torch.get_num_threads()  # before any choice: those of the machine, or OMP_NUM_THREADS
-_this = threading.local()  # of each thread: is_worker, and waited, the seconds for which it waited for its workers
-_of_programs: int | None = None  # threads of compiled programs; None: as many as torch has
+CORES = torch.get_num_threads()  # torch's number at import: cores of the machine, or OMP_NUM_THREADS
+_this = threading.local()  # for each thread: is_worker, and waited, the seconds for which it waited for its workers
+_of_programs: int | None = None  # number of threads of compiled programs; None: that of torch
 
 
 def use_threads(count: int | None) -> None:
     """Compute on a number of threads; None: on all CORES, but torch's own operations on one.
 
-    In small networks more threads of torch mostly wait for each other; compiled programs do not.
+    In small networks several threads of torch mostly wait for each other; those of compiled programs do not.
     """
     global _of_programs
     torch.set_num_threads(count or 1)
@@ -28,10 +28,10 @@ def use_threads(count: int | None) -> None:
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """The results for several parts in their order, on several threads as `use_threads` says.
+    """The results for several parts in their order, on the number of threads of `use_threads`.
 
-    It pays for compiled programs, which release Python's lock. A function that divides its own part again runs on the
-    thread that it has.
+    This is faster for compiled programs, which release Python's lock. If a function divides its own part again, it uses
+    only its own thread.
     """
     count = min(_of_programs or torch.get_num_threads(), len(parts))
     if count < 2 or getattr(_this, "is_worker", False):
@@ -39,7 +39,7 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
 
     def run(part: Part) -> tuple[Result, float]:
         began, _this.is_worker = time.thread_time(), True
-        with torch.no_grad():  # each thread has a grad mode of its own
+        with torch.no_grad():  # each thread has its own grad mode
             return function(part), time.thread_time() - began
 
     done = list(_workers(count, os.getpid()).map(run, parts))
@@ -53,14 +53,14 @@ def size_of_parts(rows: int, least: int) -> int:
 
 
 def seconds_of_work() -> float:
-    """CPU seconds of this thread, with those of its workers divided by their number: limits of work in all searches.
+    """CPU seconds of this thread, plus those of its workers divided by their number; they limit all searches.
 
-    Seconds for which other programs have the machine do not count.
+    Seconds in which other programs use the machine do not count.
     """
     return time.thread_time() + getattr(_this, "waited", 0.0)
 
 
 @functools.lru_cache(maxsize=4)
 def _workers(count: int, process: int) -> ThreadPoolExecutor:
-    """The threads of a process; one that was forked needs its own."""
+    """The threads of a process; a forked process needs its own."""
     return ThreadPoolExecutor(count, thread_name_prefix=f"lyapnet-{process}")

@@ -27,9 +27,7 @@ from lyapnet.value.calculus import gradients
 BOXES, SAMPLES = 2000, 200  # for each size of B: largest number of bounded boxes, and of states that are tested first
 GROWTH, SIZES = 1.6, 20  # ratio of two neighbouring sizes of B, and their number; the largest is half of D
 NEAR = 1e-6  # bound of ‖YZ − 1‖ for a computed inverse Z; it enters the bounds as a factor 1 + NEAR
-LEAST_SHARE_OF_RATE = (
-    0.2  # required rate as a share of that of the linearised law; at most half of the rate at the goal
-)
+LEAST_SHARE_OF_RATE = 0.2  # required rate / rate of the linearised law; half of the rate at the goal if that is less
 CORNERS = 6  # largest number of axes of P at whose corners the law is linearised
 MOST_BALLS, NEXT_BALL = 10, 0.9  # largest number of nested balls, and ratio of radii below which a next one is tried
 PIECES = 256  # number of boxes, about, into which the box around a ball is cut
@@ -74,7 +72,7 @@ class _Law:
     """F(x) in real arithmetic: for one x its traced operations, which can be differentiated; for a batch its code.
 
     Args:
-        steps: the problem whose steps F is the mean rate of; None: F = f + gu.
+        steps: a problem; F is then the mean rate over one of its steps. None: F = f + gu.
     """
 
     def __init__(self, loop: ClosedLoop, states: Box, steps: Problem | None):
@@ -244,7 +242,7 @@ def final_distance(
 ) -> float:
     """An upper bound of the distance from the goal as t → ∞ if u is rounded, so that ẋ = F̂(x) instead of F(x).
 
-    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖; for steps, the same bounds the difference quotient. As t → ∞
+    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖; for steps, with a difference quotient on the left. As t → ∞
     the closed loop therefore comes into the ball ‖Y(x − x_e)‖ ≤ R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The
     supremum over a box around that ball gives a smaller ball, and so on. The bound is R/σ plus the distance of x_e from
     the goal, where σ is the least singular value of Y.

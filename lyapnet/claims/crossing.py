@@ -35,8 +35,8 @@ class Violation(NamedTuple):
 def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], budget: Budget, enough: float) -> float:
     """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ if this set is empty.
 
-    A closed loop that starts with h ≤ 0 and whose W stays below this bound keeps h ≤ 0: if some h_j became positive,
-    then at the last time before with h_j = 0 the loop would be in this set.
+    A closed loop that starts with h ≤ 0 and whose W stays below this bound keeps h ≤ 0. Otherwise some h_j would become
+    positive, and at the last time with h_j = 0 before that, the loop would be in this set.
 
     Args:
         enough: the search stops when the bound is at least this level.

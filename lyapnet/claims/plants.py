@@ -24,7 +24,7 @@ from lyapnet.task.systems import ControlSystem
 from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
-TRIED = 8  # number of random states at which plants are compared with systems built with their parameters
+TEST_STATES = 8  # number of random states at which plants are compared with systems built with their parameters
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
         Box(lower, upper),
     )
     X0 = plants.around(controller.initial_states)
-    z = torch.cat([X0.lower[None], X0.upper[None], X0.sample(TRIED, torch.Generator().manual_seed(0)).double()])
+    z = torch.cat([X0.lower[None], X0.upper[None], X0.sample(TEST_STATES, torch.Generator().manual_seed(0)).double()])
     check_members(plants.system, _builder(controller), z, OPTION)
     return plants
 

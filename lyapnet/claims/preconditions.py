@@ -16,7 +16,7 @@ from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import random_points
 from lyapnet.prover.branches import JUMPS
 from lyapnet.prover.condition import DecreaseCondition, OwnOperations, own_constraints
-from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.problem import TEST_STATES, Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 
@@ -46,8 +46,8 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     The loop must not be traced before: these calls make its lazily computed attributes.
     """
     lower, upper = domain
-    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
-    ends = Box(lower, upper).ends(TRIED)
+    points = random_points(lower, upper, TEST_STATES, torch.Generator().manual_seed(0))
+    ends = Box(lower, upper).ends(TEST_STATES)
 
     def everything(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
         policy, V = loop.policy, loop.V
@@ -71,7 +71,9 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     if reaches_own_code(named):
         why = check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
         if why is not None:
-            logging.getLogger(__name__).warning("note: only batches of 1, 2 and %d states are tested: %s", TRIED, why)
+            logging.getLogger(__name__).warning(
+                "note: only batches of 1, 2 and %d states are tested: %s", TEST_STATES, why
+            )
     return memory
 
 
@@ -79,7 +81,7 @@ def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) ->
     """Refuse a condition whose values on batches, which closed loops use, differ from those at single points."""
     lower, upper = domain
     _require_constant(condition.closed_loop, domain)
-    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
+    points = random_points(lower, upper, TEST_STATES, torch.Generator().manual_seed(0))
 
     def all_three(t: Tensor, x: Tensor) -> Tensor:
         return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)

@@ -16,7 +16,7 @@ from lyapnet.base.provenance import versions
 from lyapnet.controller.controller import Controller, parameters_of
 from lyapnet.experiment.config import Config
 from lyapnet.task.constraints import names_of
-from lyapnet.task.cost import MadeOfAnother, QuadraticCost
+from lyapnet.task.cost import CostWrapper, QuadraticCost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem
 from lyapnet.task.systems import SYSTEMS, ControlSystem, EquationSystem
 
@@ -241,8 +241,8 @@ def _family_cost_words(system: ControlSystem) -> list[str]:
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
     """The matrices of the cost in the config, or its class and parameters; and its target, in words."""
     cost, words = controller.cost, list[str]()
-    while isinstance(cost, MadeOfAnother | FamilyCost):
-        words.extend([cost.words] if isinstance(cost, MadeOfAnother) else _family_cost_words(controller.system))
+    while isinstance(cost, CostWrapper | FamilyCost):
+        words.extend([cost.words] if isinstance(cost, CostWrapper) else _family_cost_words(controller.system))
         cost = cost.cost
     about = {"with": "; ".join(filter(None, words))} if any(words) else {}
     if isinstance(cost, QuadraticCost):

@@ -62,7 +62,7 @@ def _find_command(script: str) -> list[str]:
 def _print_result(console: Console, plan: Any, result: dict[str, Any], command: str) -> None:
     from lyapnet.evaluation.tables import evaluation_table, table_over_seeds
     from lyapnet.experiment.assembly import own_parts
-    from lyapnet.experiment.assembly.named_parts import python_of
+    from lyapnet.experiment.assembly.named_parts import python_expression
 
     title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
     console.print(
@@ -73,7 +73,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
     options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
     kind = _choose_claim(plan.config) if plan.module.members[0].problem.has_goal else "tube"
     modules = ", ".join(["lyapnet", *dict.fromkeys(name.partition(":")[0] for name in own.values())])
-    arguments = "".join(f", {part}={python_of(plan.config, part)}" for part in own)
+    arguments = "".join(f", {part}={python_expression(plan.config, part)}" for part in own)
     estimator = " --estimator ekf" if plan.config.outputs.noise is not None else ""
     path = json.dumps(str(best), ensure_ascii=False)
     for what, shown in (

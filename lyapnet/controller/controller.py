@@ -17,7 +17,7 @@ from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
 from lyapnet.controller.html import controller_as_html
 from lyapnet.controller.origin import Origin
-from lyapnet.controller.output_feedback import OutputFeedback, in_form_of
+from lyapnet.controller.output_feedback import OutputFeedback, like_given
 from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member, named, ranges_of
 from lyapnet.experiment.assembly.outputs import estimator_parts, problem_of_estimator
 from lyapnet.experiment.config import Config, OutputsConfig, SystemConfig, require_one_for_each
@@ -116,8 +116,8 @@ class Controller:
             beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load; None: the first of riccati,
                 receding and hold that keeps closed loops near the goal, chosen on first use.
             parts: the user's parts that replaced those of the config.
-            policy: the control law of V, if there is no rollout; None: the law that V is made for, or the HJB law if
-                that is unknown, with a note if it matters.
+            policy: the control law of V, if there is no rollout; None: the law for which V was trained, or the HJB law
+                if that is unknown, with a note if it matters.
             after_horizon: the result of an earlier choice of the law after T.
             origin: the checkpoint that V was loaded from; None: there is none.
 
@@ -131,7 +131,7 @@ class Controller:
         self.V, self.origin = V.requires_grad_(False).eval(), origin
         if rollout is not None and policy is not None:
             raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
-        gradient = "backprop" if problem.noise is None else "discrete"  # the only one that knows noise
+        gradient = "backprop" if problem.noise is None else "discrete"  # the only gradient that supports noise
         self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient=gradient)
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
@@ -207,7 +207,7 @@ class Controller:
 
     @property
     def plants(self) -> RandomPlants | None:
-        """The plants of its config's `randomise`, with parameters that it was not told; None if there are none."""
+        """The plants with the random parameters of its config's `randomise`; None if there are none."""
         return None if self._config is None else build_plants(self._config, self._rollout)
 
     @property
@@ -275,7 +275,7 @@ class Controller:
 
     @property
     def measures_outputs(self) -> bool:
-        """Whether the config of its run says what is measured of a state."""
+        """Whether the config of its run has outputs."""
         return self._config is not None and self._config.outputs.noise is not None
 
     def with_estimator(
@@ -298,10 +298,10 @@ class Controller:
             measure: names of the measured states; empty: the readings of the system's method output(x).
             noise: standard deviation of each reading, in its unit; one number for all measured states.
             process_noise: random walk assumed of states, by name, in the unit per √s.
-            input_disturbances: constant disturbances of controls, by name, that are estimated and taken off; each with
-                the random walk assumed of it, in its unit per √s.
+            input_disturbances: constant disturbances of controls, by name, that are estimated and subtracted; each with
+                its assumed random walk, in its unit per √s.
             initial_deviation: standard deviation of the first estimate of each state.
-            delay: after how many steps of Δt a control acts, for a late reading, computation or actuator.
+            delay: number of steps of Δt after which a control acts, because a reading, computation or actuator is late.
 
         Raises:
             UsageError: there are no outputs, or they do not fit the system.
@@ -391,7 +391,7 @@ class Controller:
                 trajectory = self._prolong(trajectory, steps - self.horizon.steps)
             trajectory = trajectory.applied(self.controls)
         return (
-            trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(in_form_of(x0, field) for field in trajectory))
+            trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(like_given(x0, field) for field in trajectory))
         )
 
     @torch.no_grad()
@@ -456,7 +456,7 @@ class Controller:
     ) -> Any:
         time, state = self._inputs(t, self._append_parameters(x, parameters) if parameters else x)
         with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
-            return in_form_of(x, function(time, state))
+            return like_given(x, function(time, state))
 
     def _inputs(self, t: Any, x: Any) -> tuple[Tensor, Tensor]:
         state = self._state(x)
@@ -480,7 +480,7 @@ class Controller:
         if not self._warned and not bool(Box(lower - room, upper + room).contains(state[..., n:]).all()):
             ranges = ranges_of(self.config, self.system)
             self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in ranges.items())
-            note = "note: V was told %s, and is asked outside of that; what it says there is extrapolated."
+            note = "note: V was trained for %s and is evaluated outside of this range; values there are extrapolated."
             logging.getLogger(__name__).warning(note, known)
         return state
 
@@ -497,13 +497,13 @@ class Controller:
 
 
 def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
-    """The control law that V is made for; the HJB law if it is unknown, with a note if that matters."""
+    """The control law for which V was trained; the HJB law if it is unknown, with a note if that matters."""
     known = known_law(problem, V)
     if known is None and (gain := gain_over_step(problem, V)) > MAX_LAW_DIFFERENCE:
         logging.getLogger(__name__).warning(
-            "note: nobody says which control law %s is made for; u is its HJB law, which at this Δt differs by %.0f %% "
-            "from the law with u held. Pass policy=lyapnet.SampledPolicy where V is about steps with u held, "
-            "lyapnet.HJBPolicy where it is about continuous time; or set V.made_for.",
+            "note: the control law for which %s was trained is unknown; u is its HJB law, which at this Δt differs by "
+            "%.0f %% from the law with u held. Pass policy=lyapnet.SampledPolicy for a V of steps with u held, "
+            "lyapnet.HJBPolicy for a V of continuous time; or set V.made_for.",
             type(V).__name__, 100 * gain,
         )  # fmt: skip
     return HJBPolicy if known is None else known

@@ -1,4 +1,4 @@
-"""What a notebook shows for a controller: a table of what it is, and its closed loops as a small drawing.
+"""The display of a controller in notebooks: a table of its properties, and a small drawing of closed loops.
 
 HTML with an inline SVG, without a script. Text and axes take the colour of the page, so that dark pages show them too.
 Names come from users' files, so every text is escaped.
@@ -21,12 +21,12 @@ from lyapnet.loop.programs import LyapunovProgram
 from lyapnet.task.constraints import names_of
 from lyapnet.task.systems import moving_states
 
-SECONDS = 1.0  # closed loops that take longer than this are not drawn
-MOST_LINES = 8  # states, and controls, that the table lists
-MOST_PANELS = 4  # states, and controls, that have a panel
+SECONDS = 1.0  # largest computing time of closed loops that are drawn
+MOST_LINES = 8  # largest number of states, and of controls, in the table
+MOST_PANELS = 4  # largest number of panels of states, and of controls
 COLUMNS, WIDTH, HEIGHT = 4, 190, 130  # panels beside each other; size of a panel in pixels
 LEFT, RIGHT, TOP, BOTTOM = 46, 8, 18, 18  # margins of a panel in pixels
-MOST_POINTS = 80  # of a curve
+MOST_POINTS = 80  # largest number of points of a curve
 STATES, CONTROLS, VALUE = "steelblue", "seagreen", "peru"  # legible on white and on black
 
 
@@ -36,7 +36,7 @@ def controller_as_html(controller: Any) -> str:
     for what, part in (("table", _table_of), ("drawing of closed loops", _drawing)):
         try:
             html.append(part(controller))
-        except Exception as error:  # whatever users' code raises: what a notebook shows is no place to fail
+        except Exception as error:  # users' code may raise anything, and a display must not fail
             html.append(_note(f"There is no {what}: {type(error).__name__}: {one_line(error)}"))
     return "".join(html)
 
@@ -57,7 +57,7 @@ def loop_as_html(loop: Any) -> str:
 
 
 def _table_of(controller: Any) -> str:
-    """What a controller is: system, X₀, controls, horizon, V, and its training."""
+    """A table of a controller: system, X₀, controls, horizon, V, and its training."""
     problem, system, horizon = controller.problem, controller.system, controller.horizon
     box, goal = controller.initial_states, controller.cost.goal
     ends = zip(system.state_labels, box.lower.tolist(), box.upper.tolist(), strict=True)
@@ -78,7 +78,7 @@ def _table_of(controller: Any) -> str:
     if named := [*names_of(problem.constraints)]:
         rows.append(("constraints", _first([str(name) for name in named])))
     if problem.noise is not None:
-        rows.append(("noise", [f"{problem.noise.sources} of it; the closed loops below are without"]))
+        rows.append(("noise", [f"{problem.noise.sources} sources; the closed loops below are without noise"]))
     return _table(type(controller).__name__, rows + _history(controller))
 
 
@@ -111,12 +111,12 @@ def _history(controller: Any) -> list[tuple[str, list[str]]]:
             ("samples", "from {:.0f} states of X₀"),
         )
         if (number := number_in(record, key)) is not None
-        and (key != "satisfied_fraction" or isinstance(program, LyapunovProgram))  # no other asks for it
+        and (key != "satisfied_fraction" or isinstance(program, LyapunovProgram))  # other programs do not require it
     ]  # fmt: skip
     if measured:
         rows.append(("measured", [", ".join(measured)]))
     own = own_parts(config)
-    if any(name.startswith("__main__:") for name in own.values()):  # of a notebook, which no command imports
+    if any(name.startswith("__main__:") for name in own.values()):  # defined in a notebook: commands cannot import it
         return rows
     parts = [word for part, name in own.items() for word in (f"--{part}", name)]
     command = shlex.join(["lyapnet", "view", origin.path, *parts, "--out", "page.html"])
@@ -135,7 +135,7 @@ def _note(text: str) -> str:
 
 
 def _first(lines: list[str]) -> list[str]:
-    """The first of many lines, and how many more there are."""
+    """The first lines, and the number of further ones."""
     left = len(lines) - MOST_LINES
     return lines if left <= 0 else [*lines[:MOST_LINES], f"and {left} more"]
 
@@ -164,7 +164,7 @@ def _drawing(controller: Any) -> str:
     box, system, horizon = controller.initial_states, controller.system, controller.horizon
     x0 = torch.cat([box.center[None], box.corners(2)])
     controller.policy(0.0, x0)  # the first call of a law is slower
-    begun = time.thread_time()  # of work, which other programs do not prolong
+    begun = time.thread_time()  # CPU time, which does not depend on other programs
     controller.policy(0.0, x0)
     expected = horizon.steps * (time.thread_time() - begun)
     if expected > SECONDS:

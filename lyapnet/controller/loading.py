@@ -82,9 +82,9 @@ def _controller_of(
     problem.check_value_function(V)
     after_horizon = from_plain(content[KEY].get(AFTER_HORIZON))
     if others := problem.differences(content[KEY].get("problem")):
-        after_horizon = None  # it was found for another problem
+        after_horizon = None  # it was chosen for another problem
         logging.getLogger(__name__).warning(
-            "note: %s was trained for a problem with other %s; what follows is about the one that is given here.",
+            "note: %s was trained for a problem with other %s; results are about the problem that is given now.",
             path, ", ".join(others),
         )  # fmt: skip
     problem, V = problem.to(device), V.to(device)

@@ -19,31 +19,32 @@ from lyapnet.task.outputs import Outputs, Readings
 from lyapnet.task.problem import Problem
 from lyapnet.value.law_after_horizon import ContinuedPolicy
 
-ROUNDING = 1e-6  # by which a setting may exceed its range, relative to it: a problem in float32 has rounded ends
+ROUNDING = 1e-6  # largest excess of a setting over its range, relative to it; ends of ranges are rounded in float32
 
 
 class OutputFeedback:
     """y_k ↦ u(t_k, x̂_k), called once in each Δt: x̂_k is the estimate from all readings up to y_k.
 
     The first call is at t = 0: its readings correct the first estimate before the first control. Each further call
-    predicts one step under the control of the call before, and corrects by its readings. Each loop of a batch, of the
-    shape of the first readings, has an estimate of its own; computations are in float64. Disturbances d of controls
-    that are estimated too are taken off: the control is u(t, x̂) − d̂, within its limits.
+    predicts one step under the control of the call before, and corrects by its readings. Each loop of a batch, whose
+    shape is that of the first readings, has its own estimate; computations are in float64. Estimated disturbances d of
+    controls are subtracted: the control is u(t, x̂) − d̂, within its limits.
 
-    With a delay of d steps a control acts from d Δt after its readings on. Which controls act until then is known, so
-    that it is u(t_k + dΔt, x̂) at the state x̂ that the model predicts for that time; at first u at rest acts. For a
-    plant like the model, without noise, that is the best law from dΔt on if V is optimal.
+    With a delay of d steps a control acts d Δt after its readings. The controls that act until then are known, and the
+    model predicts the state x̂ at t_k + dΔt from them; the control is u(t_k + dΔt, x̂). Before the first one, the
+    control at rest acts. For a plant that equals the model, without noise, this law is optimal from dΔt on if V is.
 
     Args:
         law: u(t, x) with its V, for all t ≥ 0.
-        problem: the steps that the estimator predicts with. Its states are those of the law, or (x, p) with parameters
-            p that are estimated too; disturbances d of controls come last.
+        problem: the steps for the predictions of the estimator. Its states are those of the law, or (x, p) with
+            estimated parameters p; disturbances d of controls come last.
         outputs: h and the noise of the readings.
         kind: ekf, the extended Kalman filter; or ukf, the unscented one.
         drift: see KalmanFilter.
         deviation: standard deviation of the first estimate, (n,).
-        delay: d, after how many steps a control acts.
-        around_state: whether evaluations draw the first estimate around x₀ by this deviation, or take the centre of X₀.
+        delay: d, the number of steps after which a control acts.
+        around_state: whether evaluations draw the first estimate around x₀ with this deviation, or use the centre of
+            X₀.
         controller: the Controller whose law it is, for exports.
 
     Raises:
@@ -59,9 +60,9 @@ class OutputFeedback:
     controller: Any
     problem: Problem
     filter: KalmanFilter
-    state_of_law: State  # a state that its law takes: its length, precision and device
-    settings: dict[str, int]  # those of a family: name ↦ index of the state
-    ranged: list[int]  # the states that are parameters p, whose estimates stay in their ranges
+    state_of_law: State  # an example of the law's argument x: its length, precision and device
+    settings: dict[str, int]  # settings of a family: name ↦ index of the state
+    ranged: list[int]  # indices of the parameters p, whose estimates stay in their ranges
 
     def __init__(
         self, law: ContinuedPolicy, problem: Problem, outputs: Outputs, kind: str, drift: Deviations,
@@ -87,7 +88,7 @@ class OutputFeedback:
         return loop_as_html(self)
 
     def reset(self, x_hat: Any = None, P: Any = None, t: float = 0.0) -> None:
-        """Begin again: the next call of `step` is at t.
+        """Restart: the next call of `step` is at t.
 
         Args:
             x_hat: the first estimate (*batch, n); None: the centre of X₀.
@@ -113,7 +114,7 @@ class OutputFeedback:
         if not (bool(first.isfinite().all()) and math.isfinite(t)):
             raise ValueError(f"Expected finite x_hat and t, got {first.tolist()} and {t}; give numbers.")
         self._belief, self._t, self._began = Belief(first, covariance), float(t), 0.0
-        self._due: Tensor | None = None  # the controls of this interval and of the d after it, (d + 1, *batch, m)
+        self._due: Tensor | None = None  # controls in this interval and in the next d, (d + 1, *batch, m)
         self._like: Any = x_hat if x_hat is not None else np.empty(0)
 
     def middle_estimate(self) -> State:
@@ -126,8 +127,8 @@ class OutputFeedback:
     def draw_first(self, x0: State, generator: torch.Generator) -> State:
         """A first estimate for each x₀: the centre of X₀, or around x₀ in states that X₀ fixes.
 
-        With a deviation given it is around x₀ in all states. Of parameters and disturbances it is always the centre,
-        but settings, such as targets, are those of x₀.
+        If a deviation is given, it is around x₀ in all states. For parameters and disturbances it is always the centre;
+        settings, such as targets, are those of x₀.
         """
         box, constants = self.problem.initial_states, list(self.problem.system.constants)
         around = (box.widths == 0) | self.around_state
@@ -149,12 +150,12 @@ class OutputFeedback:
     @property
     def x_hat(self) -> Any:
         """x̂ (*batch, n) after the last readings."""
-        return in_form_of(self._like, self._belief.x)
+        return like_given(self._like, self._belief.x)
 
     @property
     def d_hat(self) -> Any:
-        """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 where none is estimated."""
-        return in_form_of(self._like, self._disturbances(self._belief.x))
+        """The estimated disturbances of controls (*batch, k), the last of `x_hat`; k = 0 if none is estimated."""
+        return like_given(self._like, self._disturbances(self._belief.x))
 
     def _disturbances(self, x: State) -> Tensor:
         return x[..., self.problem.system.n - len(self._disturbed) :]
@@ -163,7 +164,7 @@ class OutputFeedback:
     def at_range_end(self) -> list[str]:
         """Names of the parameters whose estimate is at an end of its range, in any loop of the batch.
 
-        The plant may then be beyond what V was trained for, and an offset may stay.
+        The plant may then be outside the range for which V was trained, and an offset may remain.
         """
         lower, upper = self._ends
         p = self._belief.x.reshape(-1, self.problem.system.n)[:, self.ranged]
@@ -173,7 +174,7 @@ class OutputFeedback:
     @property
     def P(self) -> Any:
         """The covariance of x̂ (*batch, n, n) after the last readings."""
-        return in_form_of(self._like, self._belief.P)
+        return like_given(self._like, self._belief.P)
 
     @torch.no_grad()
     def step(self, y: Any, applied: Any = None, **settings: Any) -> Any:
@@ -183,11 +184,11 @@ class OutputFeedback:
 
         Args:
             y: the readings; NaN for one that is missing.
-            applied: the control that the plant received since the last call, if it was not `acting`; of no meaning in
-                the first call.
-            settings: of a family: parameters that the plant does not know, such as a target, from now on; each a number
-                or (*batch,). Those that are left out stay as they are, at first in the middle of their ranges. Where
-                one changes the horizon begins anew.
+            applied: the control that the plant received since the last call, if it was not `acting`; ignored in the
+                first call.
+            settings: new values of settings of a family, such as a target, each a number or (*batch,). Settings that
+                are left out keep their values, initially the middle of their ranges. The horizon restarts if one
+                changes.
 
         Raises:
             ValueError: the shapes do not fit, a reading is infinite, or a setting is unknown or outside its range.
@@ -204,17 +205,17 @@ class OutputFeedback:
         t = self._t - self._began + self.delay * self.problem.horizon.dt
         u = self.without_disturbances(self.law(like.new_tensor(t), x[..., : len(like)].to(like)).detach(), x)
         self._due = torch.cat([self._due[:-1], u.double().cpu()[None]])
-        return in_form_of(y, u)
+        return like_given(y, u)
 
     @property
     def acting(self) -> Any:
-        """The control (*batch, m) that acts until the next call of `step`, once it was called."""
+        """The control (*batch, m) that acts until the next call of `step`; available after the first call."""
         if self._due is None:
             raise ValueError("Expected acting after a call of step, got none since the reset; call step first.")
-        return in_form_of(self._like, self._due[0])
+        return like_given(self._like, self._due[0])
 
     def without_disturbances(self, u: Control, x: State) -> Control:
-        """u − d̂ within the limits, for the estimate x (*batch, n); u where no disturbance is estimated."""
+        """u − d̂ within the limits, for the estimate x (*batch, n); u if no disturbance is estimated."""
         if not self._disturbed:
             return u
         disturbed = torch.tensor(self._disturbed, device=u.device)
@@ -222,11 +223,11 @@ class OutputFeedback:
 
     def corrected(self, belief: Belief, y: Readings) -> Belief:
         """The belief after readings y, with parameters within their ranges."""
-        return self._with_parameters_in_range(self.filter.update(belief, y))
+        return self._clamp_parameters(self.filter.update(belief, y))
 
     @torch.no_grad()
     def observe(self, y: Any, applied: Any = None) -> None:
-        """The estimate after readings y, without a control; see `step`."""
+        """Update the estimate by readings y without computing a control; see `step`."""
         readings, p = _float64(y), self.outputs.count
         batch = tuple(self._belief.x.shape[:-1])
         if readings.ndim < 1 or readings.shape[-1] != p or (self._due is not None and readings.shape[:-1] != batch):
@@ -239,15 +240,15 @@ class OutputFeedback:
             raise ValueError("Expected finite readings, got an infinite one; write NaN for one that is missing.")
         self._like = y
         if self._due is None:
-            belief = self._first_of(tuple(readings.shape[:-1]))
+            belief = self._first_estimate(tuple(readings.shape[:-1]))
         else:
             u = self._due[0] if applied is None else self._applied(applied, self._due[0])
-            self._due = torch.cat([self._due[1:], self._due[-1:]])  # without a new one the last goes on
+            self._due = torch.cat([self._due[1:], self._due[-1:]])  # without a new control the last one continues
             belief, self._t = self.filter.predict(self._belief, u), self._t + self.problem.horizon.dt
         self._belief = self.corrected(belief, readings)
 
     def named_settings(self, states: Tensor) -> dict[str, Tensor]:
-        """Settings by name, as `step` takes them, from the states that hold them, (*batch, k): weights from log₁₀."""
+        """Settings by name, as `step` takes them, from their entries of states, (*batch, k); weights from log₁₀."""
         names = self.problem.system.state_names
         return {
             name: 10**entry if names[i].startswith(LOGARITHM) else entry
@@ -255,7 +256,7 @@ class OutputFeedback:
         }
 
     def _change(self, settings: Mapping[str, Any]) -> None:
-        """Take settings; if one differs, the horizon begins now."""
+        """Change settings; if one differs, the horizon restarts."""
         x, box = self._belief.x.clone(), self.problem.initial_states
         for name, value in settings.items():
             if name not in self.settings:
@@ -280,7 +281,7 @@ class OutputFeedback:
 
     @staticmethod
     def _applied(given: Any, own: Tensor) -> Tensor:
-        """The control that the plant received, in the shape of the control that was returned."""
+        """The control that the plant received, in the shape of the returned control."""
         u = _float64(given)
         if u.shape != own.shape or not bool(u.isfinite().all()):
             raise ValueError(
@@ -289,7 +290,7 @@ class OutputFeedback:
             )
         return u
 
-    def _with_parameters_in_range(self, belief: Belief) -> Belief:
+    def _clamp_parameters(self, belief: Belief) -> Belief:
         """The belief with estimates of parameters p moved into their ranges, beyond which f and V may be undefined."""
         if not self.ranged:
             return belief
@@ -302,7 +303,7 @@ class OutputFeedback:
         box = self.problem.initial_states
         return box.lower[self.ranged], box.upper[self.ranged]
 
-    def _first_of(self, batch: tuple[int, ...]) -> Belief:
+    def _first_estimate(self, batch: tuple[int, ...]) -> Belief:
         """The first estimate of each loop of a batch."""
         x, P = self._belief
         try:
@@ -324,6 +325,6 @@ def _is_covariance(P: Tensor) -> bool:
     return symmetric and bool((torch.linalg.eigvalsh(P) >= -1e-9 * size[..., 0]).all())
 
 
-def in_form_of(given: Any, result: Any) -> Any:
-    """A tensor as it is where a tensor was given, else as an array."""
+def like_given(given: Any, result: Any) -> Any:
+    """The result as a tensor if a tensor was given, else as an array."""
     return result if isinstance(given, Tensor) else result.numpy(force=True)

@@ -55,7 +55,7 @@ class Film(Movie):
         self.palette: Image.Image = _palette()
         self.figure = Figure(figsize=(8.6, 4.3), layout="constrained")
         drawn = [self._shapes(node, 0) for node in (0, len(self.u))]
-        self._scene = self._stage() if any(drawn) else self._plane() if problem.system.n > 1 else self._course()
+        self._scene = self._stage() if any(drawn) else self._plane() if problem.system.n > 1 else self._time_panel()
         self._curves = self._panels()
         self._canvas = FigureCanvasAgg(self.figure)
         self.figure.set_dpi(110)
@@ -120,7 +120,7 @@ class Film(Movie):
 
         return draw_node
 
-    def _course(self) -> Any:
+    def _time_panel(self) -> Any:
         """Prepare the panel of a single state over time; return the function that draws the curve up to a node."""
         panel, problem = self._left_panel(), self.problem
         low, high = float(self.x.min()), float(self.x.max())

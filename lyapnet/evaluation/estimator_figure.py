@@ -1,4 +1,4 @@
-"""A figure of states, their estimates and what the estimator knows of its error, along one closed loop."""
+"""A figure of states, their estimates and the standard deviations of these, along one closed loop."""
 
 from matplotlib.figure import Figure
 
@@ -14,7 +14,7 @@ ROOM = 0.15  # space above and below the curves, relative to their extent
 def states_and_estimates(loops: EstimatedLoops, estimator: OutputFeedback) -> Figure:
     """Each state of the first closed loop, its estimate with a band of ± 2 standard deviations, and its readings.
 
-    The band is drawn as far as the panel goes, which is scaled by state and estimate: at first it is often wider.
+    Panels are scaled by state and estimate, so that a wide band, as often at first, is cut off.
     """
     system, outputs = estimator.problem.system, estimator.outputs
     measured = {name: k for k, name in enumerate(outputs.names)}

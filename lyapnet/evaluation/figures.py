@@ -24,8 +24,8 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem, moving_states
 
-MOST_PANELS = 12  # states, and controls, that a figure over time has a panel for
-MOST_NAMED = 4  # other states whose values fit into a line under a slice
+MOST_PANELS = 12  # largest number of states, and of controls, with a panel in a figure over time
+MOST_NAMED = 4  # largest number of other states whose values are written under a slice
 
 
 class Slice(NamedTuple):
@@ -157,7 +157,7 @@ def states_and_controls_to_draw(system: ControlSystem) -> tuple[list[int], list[
 
 
 def name_panels_left_out(figure: Figure, system: ControlSystem) -> None:
-    """Say above a figure how many states and controls have no panel, if there are some."""
+    """Write above a figure how many states and controls there are, if some have no panel."""
     states = len(moving_states(system))
     if max(states, system.m) > MOST_PANELS:
         figure.suptitle(f"at most {MOST_PANELS} of {states} states and of {system.m} controls", fontsize=9)

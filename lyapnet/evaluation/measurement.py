@@ -30,8 +30,8 @@ from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 PATHS = 32  # paths of the noise from each state
-NOT_ASKED = "The optimum was not asked for"
-TOO_MUCH_SPREAD = "log E exp(θJ)/θ is not measured, as too few of these paths count in it; costs are E J"
+NOT_ASKED = "The optimum was not requested"
+TOO_MUCH_SPREAD = "log E exp(θJ)/θ is not measured, because too few of these paths count in it; costs are E J"
 CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
 
@@ -60,7 +60,7 @@ class Evaluation(NamedTuple):
     optimum_of: str = ""  # model of the optimum: its steps, or continuous time; empty if none was computed
     noise: NoiseMeasures | None = None  # with noise; costs are then expectations
     plants: OnPlants | None = None  # with random plants; all other measures are those on the model
-    estimated: EstimatorMeasures | None = None  # with outputs; all other measures are those with the state known
+    estimated: EstimatorMeasures | None = None  # with outputs; all other measures are those with known state
     program: str = ""  # name of the class by which V was trained
 
     def result(self) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def _evaluation_on_model(
     controller: Controller, x0: State, samples: int, seed: int, optimum: bool, progress: Report
 ) -> Evaluation:
     """The measures without noise, on the model."""
-    trajectory = controller.closed_loops(x0)  # whose controls are elements of U, as optima are
+    trajectory = controller.closed_loops(x0)  # with controls as elements of U, like those of optima
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
     cost, left = cost_within_domain(controller.problem, trajectory)

@@ -11,8 +11,8 @@ from lyapnet.evaluation.figures import name_panels_left_out, states_and_controls
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.problem import Problem
 
-PATHS = 200  # from each initial state
-STATES = 2  # initial states, so that bands can be told apart
+PATHS = 200  # number of paths from each initial state
+STATES = 2  # number of initial states; bands of more would overlap
 BAND = (0.05, 0.95)  # probabilities of the edges of a band
 
 

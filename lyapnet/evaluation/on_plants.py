@@ -1,4 +1,4 @@
-"""Measures of a controller on plants with random parameters that it was not told."""
+"""Measures of a controller on plants with random parameters that it does not know."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from lyapnet.value.expansions import in_float64, path_under
 
 
 class OnPlants(NamedTuple):
-    """The closed loops from some states, each on a plant of its own."""
+    """The closed loops from some states, each on another plant."""
 
     plants: RandomPlants
     z0: StateOfPlant  # (x₀, p) of each closed loop

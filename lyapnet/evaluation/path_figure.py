@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, Rectangle
 from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import Ball, parts_of
-from lyapnet.task.cost import Cost, MadeOfAnother, ObstacleCost
+from lyapnet.task.cost import Cost, CostWrapper, ObstacleCost
 from lyapnet.task.problem import Problem
 
 
@@ -68,7 +68,7 @@ def _disks(problem: Problem) -> Iterator[tuple[str, tuple[int, ...], list[float]
         if isinstance(part, Ball):
             yield "outside" if part.side > 0 else "inside", (*part.states.tolist(),), part.center.tolist(), part.radius
     cost: Cost = problem.cost
-    while isinstance(cost, MadeOfAnother):
+    while isinstance(cost, CostWrapper):
         if isinstance(cost, ObstacleCost):
             yield "cost", (*cost.states.tolist(),), cost.centre.tolist(), cost.radius
         cost = cost.cost

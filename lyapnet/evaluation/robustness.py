@@ -14,7 +14,7 @@ from lyapnet.base.types import Control, State, Time
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
-from lyapnet.experiment.assembly import knows, ranges_of, with_parameters
+from lyapnet.experiment.assembly import is_in_range, ranges_of, with_parameters
 from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.task.family import FamilySystem, parameter_of
 from lyapnet.task.problem import Problem
@@ -33,7 +33,7 @@ def physical_parameters(system: ControlSystem, parameters: Mapping[str, Any]) ->
 
 
 def unchanged_parameters(system: ControlSystem, parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Name ↦ reason of a constructor's arguments of which no share is taken: all but positive real numbers.
+    """Name ↦ reason of a constructor's arguments that are not varied: all but positive real numbers.
 
     An integer counts as real if the constructor expects a float, as for a mass of 1 kg, but not for 3 links.
     """
@@ -90,10 +90,10 @@ class NoisyPolicy(nn.Module):
 
 
 class LatePolicy(nn.Module):
-    """A law with a delay of one sample: on [t_n, t_n + Δt) acts what was computed from x_{n−1}, at first u at rest.
+    """A law with a delay of one sample: on [t_n, t_n + Δt) acts the control computed from x_{n−1}, at first u*.
 
-    What is computed from x_n is u(t_n, x_n), or with a prediction u(t_n + Δt, F(x_n, u_n)), where u_n acts meanwhile
-    and F is the model's step: without disturbances that is the best law from t = Δt on.
+    The control computed from x_n is u(t_n, x_n), or with a prediction u(t_n + Δt, F(x_n, u_n)), where u_n acts
+    meanwhile and F is the model's step. Without disturbances the prediction is the best law from t = Δt on.
 
     Args:
         policy: u(t, x).
@@ -109,7 +109,7 @@ class LatePolicy(nn.Module):
         self.computed: Control | None = None  # the control that acts next
 
     def forward(self, t: Time, x: State) -> Control:
-        if t.ndim:  # all nodes at once, of a path that is known
+        if t.ndim:  # all nodes of a known path at once
             return self.policy(t, x)
         u = self.computed
         if u is None or t == 0:
@@ -132,7 +132,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
     3. noise of 1 % on the measured state;
     4. a delay of one sample, without and with a prediction by the model, see LatePolicy;
     5. half the Δt;
-    6. continuous time. A law that is made to be held is held for Δt, with fourth order steps, and so is the optimum.
+    6. continuous time. A law for held controls is held for Δt, with fourth order steps, and so is the optimum.
        Another law is evaluated at every t by an adaptive integrator; its optimum uses half the Δt, or Riccati.
 
     For a family it is the task of one member, see `nominal`. If V accepts the disturbed parameter, there is also the
@@ -154,7 +154,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
             yield undisturbed._replace(
                 name=f"{name.replace('_', ' ')} {share:+.0%}", problem=problem.replaced(system=system)
             )
-            if name in family and knows(ranges[name], value * (1 + share)):
+            if name in family and is_in_range(ranges[name], value * (1 + share)):
                 told = whole.with_(**{**family, name: value * (1 + share)})
                 policy = told.closed_loop.policy
                 named = f"{name.replace('_', ' ')} {share:+.0%}, told"
@@ -188,7 +188,7 @@ def nominal(family: Controller) -> dict[str, float]:
         for name, (least, greatest) in ranges.items()
     }
     given = {name: parameter_of(system.system, name, middle[name]) for name in middle}
-    return {name: value if knows(ranges[name], value) else middle[name] for name, value in given.items()}
+    return {name: value if is_in_range(ranges[name], value) else middle[name] for name, value in given.items()}
 
 
 def not_varied(controller: Controller) -> dict[str, str]:

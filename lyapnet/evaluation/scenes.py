@@ -40,7 +40,7 @@ class Picture:
         self._seen = _corners(self.problem, [numpy_of(box.lower), numpy_of(box.upper), x], self.control)
 
     def go_on(self, x: np.ndarray, u: np.ndarray) -> None:
-        """Append the state x (n,) that the control u (m,) led to."""
+        """Append the state x (n,) after the control u (m,)."""
         self.path.append(x)
         self.control = u
 
@@ -59,7 +59,7 @@ class Picture:
             for shape in shapes:
                 panel.add_artist(artist_of(shape, BLUE))
         elif self.problem.system.n == 1:
-            self._course(panel)
+            self._time_panel(panel)
         else:
             self._plane(panel)
         dt = self.problem.horizon.dt
@@ -73,7 +73,7 @@ class Picture:
         panel.plot(*path[:, axes].T, color=BLUE, linewidth=1.0)
         panel.plot(*path[-1, axes], "o", color=BLUE, markersize=5)
 
-    def _course(self, panel: Axes) -> None:
+    def _time_panel(self, panel: Axes) -> None:
         dt, box = self.problem.horizon.dt, self.problem.initial_states
         t, x = dt * np.arange(len(self.path)), np.array(self.path)[:, 0]
         panel.set_xlim(0, self.problem.horizon.duration)

@@ -126,7 +126,7 @@ def _plant_rows(result: dict[str, Any]) -> dict[str, str]:
     }
     share = found["finite_fraction"]
     return {
-        "on random plants, of which the law is told nothing: cost J, mean": (
+        "on random plants, unknown to the law: cost J, mean": (
             f"not finite on {1 - share:.1%}" if share < 1 else f"{found['cost_mean']:.4g}"
         ),
         **(ratios if found["optimal_cost_mean"] is not None else {}),
@@ -210,14 +210,14 @@ def _entry(key: str, value: float | None) -> str:
 
 
 def _caption(results: list[dict[str, Any]]) -> Text | None:
-    """Sentences on the model of the optimum, and why some optima are missing."""
+    """Sentences about the model of the optimum, and why some optima are missing."""
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
         notes = {f"The optimum is that of {about}": None, **notes}
     if any((result.get("noise") or {}).get("with_risk") is not None for result in results):
         notes["Costs and the optimum are log E exp(θJ)/θ, of which V is the least"] = None
     if any((result.get("held_cost_ratio") or 1) < 1 for result in results):
-        notes["A plant in continuous time may pay less than that optimum: the steps overstate the cost"] = None
+        notes["A plant in continuous time may cost less than that optimum, because the steps overstate the cost"] = None
     notes |= {f"After T follows the law {result['after_T']}": None for result in results if "after_T" in result}
     caption = " ".join(f"{note.rstrip('.')}." for note in notes)
     return Text(caption) if notes else None  # Text, because [oracle] in a string would be markup
@@ -236,7 +236,7 @@ def robustness_table(
     title = f"{samples} states each" + f" of the member {named}" * bool(named)
     headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
     columns = [Column(heading, justify="right") for heading in headings]
-    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{title}")
+    table = Table("disturbance", *columns, title=f"disturbances that the controller does not know\n{title}")
     for row in rows:
         keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
         cost, *others = (measured_or_not(key, row[key]) for key in keys)

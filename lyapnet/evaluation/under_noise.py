@@ -22,7 +22,7 @@ from lyapnet.value.risk import mean_with_risk
 QUANTILES = (0.05, 0.5, 0.95)  # probabilities of the reported quantiles of the costs of all paths
 ENOUGH_PATHS, FEWEST_PATHS = 0.2, 8  # share and number of paths that have to count in a mean of exponentials
 FAR_FROM_ONE = 0.1  # distance from 1 of a sample mean with expectation 1, above which the sample is too small
-DEAREST = 0.05  # share of a state's paths, those of highest cost, whose mean cost measures its risk
+DEAREST = 0.05  # share of the most expensive paths from a state, whose mean cost measures its risk
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
 
@@ -35,17 +35,17 @@ class NoiseMeasures(NamedTuple):
     exponential, and it is not measured.
     """
 
-    paths: int  # from each initial state
-    mean: float  # of J − M: E J
-    half_width: float  # of the 95 % interval of E J, averaged over the states
+    paths: int  # number of paths from each initial state
+    mean: float  # mean of J − M, an estimate of E J
+    half_width: float  # half-width of the 95 % interval of E J, averaged over the states
     plain_mean: float  # mean of J itself
-    plain_half_width: float  # of its 95 % interval
-    quantiles: dict[str, float]  # of J over all states and paths, by probability
+    plain_half_width: float  # half-width of its 95 % interval
+    quantiles: dict[str, float]  # quantiles of J over all states and paths, by probability
     dearest_mean: float  # mean of J over the 5 % of paths of highest cost from a state, averaged over the states
     lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
     risk: float  # θ
     with_risk: float | None  # mean over the states of (1/θ) log E exp(θJ); None if θ = 0 or it cannot be measured
-    with_risk_half_width: float | None  # of its 95 % interval
+    with_risk_half_width: float | None  # half-width of its 95 % interval
 
 
 @torch.no_grad()
@@ -58,7 +58,7 @@ def measure_under_noise(
     a risk, the costs of the table and of LQR are certainty equivalents, where these can be measured.
 
     Args:
-        counted: number of first states that the measures are about.
+        counted: the measures are about this number of first states.
     """
     problem, horizon = controller.problem, controller.horizon
     assert problem.noise is not None
@@ -111,8 +111,8 @@ def measure_under_noise(
 def _enough_paths_count(exponentials: Tensor) -> bool:
     """Whether enough of some exponentials (paths, states) of mean one count: ENOUGH_PATHS of all, and FEWEST_PATHS.
 
-    What counts is the effective sample size (Σz)²/Σz² of each state, averaged over the states. The mean of all has to
-    be near one, too: that of those drawn is far below one if none of those that count is among them.
+    Paths count by the effective sample size (Σz)²/Σz² of each state, averaged over the states. The mean of all samples
+    also has to be near one: it is far below one if the sample lacks the rare paths that count most.
     """
     size = exponentials.sum(0).square() / exponentials.square().sum(0)
     mean = float(exponentials.mean())
@@ -130,9 +130,9 @@ def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor], r
 
 
 def _mean_of_dearest(J: Tensor) -> PerState:
-    """The conditional value at risk of each state: the mean of its DEAREST share of paths, of J (paths, states).
+    """The conditional value at risk of each state: the mean J of the DEAREST share of its paths, for J (paths, states).
 
-    A path that lies only in part within this share counts in part.
+    A path that belongs to this share only in part counts in part.
     """
     count = DEAREST * len(J)
     share = (count - torch.arange(len(J)).to(J)).clamp(0, 1)[: math.ceil(count)]
@@ -144,7 +144,7 @@ AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits", "at_border"
 
 
 def average(tables: Sequence[StateTable]) -> StateTable:
-    """One table of several of the same states: means of AVERAGED columns, the largest h, the rest of the first.
+    """The table that summarises several of the same states: means of AVERAGED columns, the largest h, else the first.
 
     A state has left the domain if one of its paths has.
     """

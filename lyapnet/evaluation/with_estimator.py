@@ -18,7 +18,7 @@ from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.task.systems import ControlSystem
 from lyapnet.value.expansions import path_under
 
-RARE = 0.999  # probability up to which errors count as not rare, if P is right
+RARE = 0.999  # errors beyond this quantile count as rare, if P is right
 MOST_OUTLIERS = 0.01  # largest share of runs with rare errors for an estimator to count as consistent
 
 
@@ -53,20 +53,20 @@ class EstimatorMeasures(NamedTuple):
     readings: dict[str, float]  # name ↦ standard deviation of its noise
     known_cost_mean: float  # E J with the state known
     cost_mean: float  # E J with the estimator
-    cost_ratio: float | None  # of these means; None where the first is not positive
-    half_width: float | None  # of its 95 % interval
+    cost_ratio: float | None  # ratio of these means; None if the first is not positive
+    half_width: float | None  # half-width of its 95 % interval
     lost_fraction: float  # share of loops that cost LOST_EXCESS more than with the state known, or are not finite
     nees: float  # (x − x̂)ᵀP⁻¹(x − x̂)/n, averaged over steps and runs: 1 if P is right, above 1 if it is too small
-    nees_half_width: float  # of its 95 % interval, from the spread of the runs
-    nees_band: tuple[float, float]  # that contains the mean over the runs at a step with 95 % if P is right
+    nees_half_width: float  # half-width of its 95 % interval, from the spread of the runs
+    nees_band: tuple[float, float]  # interval that contains the mean over the runs at a step with 95 % if P is right
     nees_inside: float  # share of the steps at which that mean is within the band
     delay: int  # steps after its readings at which a control acts
-    outlier_fraction: float  # share of runs with (x − x̂)ᵀP⁻¹(x − x̂) at T above what 99.9 % have if P is right
+    outlier_fraction: float  # share of runs with (x − x̂)ᵀP⁻¹(x − x̂) at T above its 99.9 % quantile if P is right
     errors: dict[str, tuple[float, float]]  # state ↦ (its root mean square error at T, √P there), in its unit
 
     @property
     def consistent(self) -> bool:
-        """Whether 1 is within the 95 % interval of `nees`, and few errors are rare: some that diverge make it wide."""
+        """Whether 1 is in the 95 % interval of `nees`, and few errors are rare; diverging loops widen the interval."""
         return abs(self.nees - 1) <= self.nees_half_width and self.outlier_fraction <= MOST_OUTLIERS
 
 

@@ -125,7 +125,9 @@ def _is_as_written(path: Path, content: dict[str, Any], digest: Any) -> bool:
 
 @functools.cache  # only once for each file, which is read several times
 def _note_missing_digest(path: Path) -> None:
-    logging.getLogger(__name__).warning("note: %s has no digest, as lyapnet 0.1 left it; it is taken as it is.", path)
+    logging.getLogger(__name__).warning(
+        "note: %s has no digest, because lyapnet 0.1 wrote none; only the checksums of its archive are verified.", path
+    )
 
 
 def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any:
@@ -140,11 +142,11 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         require_file(path)
     except IsADirectoryError as error:
         raise UsageError(
-            f"Expected a checkpoint file, got the folder {str(path)!r}; in a run's it is checkpoints/best.ckpt."
+            f"Expected a checkpoint file, got the folder {str(path)!r}; a run has checkpoints/best.ckpt."
         ) from error
     except FileNotFoundError as error:
         raise UsageError(
-            f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
+            f"Expected a checkpoint file, got {str(path)!r}, which does not exist; see logs/*/*/checkpoints."
         ) from error
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         raise UsageError(

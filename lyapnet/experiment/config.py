@@ -22,8 +22,8 @@ from lyapnet.experiment.schema import Names, check_values, checked, differences,
 from lyapnet.task.models.reading import KINDS
 
 TEXTS = ("equations", "drawing")  # keys of the section system whose values have many lines
-MOST_LINES = 20  # lines of each in tables and text of loggers
-PLACE = "TEXT"  # in their place while the rest is written as YAML
+MOST_LINES = 20  # largest number of these lines in tables and in the text of loggers
+PLACE = "TEXT"  # placeholder for such a text while the rest is written as YAML
 
 # names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
@@ -402,7 +402,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
 
 
 def _require_noise_of_each(content: Mapping[str, Any], overrides: Sequence[str], outputs: OutputsConfig) -> None:
-    """Require a list outputs.noise to have one entry for each reading; only a number written as such is for all."""
+    """Require a list outputs.noise to have one entry for each reading; a number without brackets holds for all."""
     written = None
     for layer in (OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))):
         written = OmegaConf.select(layer, "outputs.noise", default=written)
@@ -420,7 +420,7 @@ def require_one_for_each(noise: Sequence[float] | None, measure: Sequence[str]) 
 
 
 def _with_reference(config: Config, folder: Path) -> Config:
-    """The config with the points of the file of its reference, which is found from the folder of the YAML."""
+    """The config with the points from the file of its reference, whose path is relative to the folder of the YAML."""
     reference = config.reference
     if not reference.file:
         return config
@@ -431,7 +431,7 @@ def _with_reference(config: Config, folder: Path) -> Config:
 
 
 def _with_model(config: Config, folder: Path) -> Config:
-    """The config with the equations of the model that its system is read from."""
+    """The config with the equations from the model file of its system."""
     system = config.system
     if not system.file:
         return config
@@ -456,7 +456,7 @@ def _with_model(config: Config, folder: Path) -> Config:
 
 
 def _none_if_infinite(limits: Sequence[float]) -> list[float | None] | None:
-    """Limits with None where there is none; None if there are none at all."""
+    """Limits with None instead of ±∞; None if all are infinite."""
     given = [limit if math.isfinite(limit) else None for limit in limits]
     return None if all(limit is None for limit in given) else given
 
@@ -504,7 +504,7 @@ def to_plain(config: Config) -> dict[str, Any]:
 
 
 def abridged(config: Config) -> Config:
-    """The config for tables and text of loggers: of long texts, the first lines."""
+    """The config for tables and the text of loggers, with only the first lines of long texts."""
     texts = {key: getattr(config.system, key).splitlines() for key in TEXTS}
     shortened = {
         key: "\n".join([*lines[:MOST_LINES], f"# and {len(lines) - MOST_LINES} further lines, in config.yaml"])
@@ -515,7 +515,7 @@ def abridged(config: Config) -> Config:
 
 
 def to_yaml(config: Config) -> str:
-    """The resolved config as YAML; one number for all readings is written as such, and texts line by line."""
+    """The resolved config as YAML; a single number for all readings is written without brackets, texts line by line."""
     plain = to_plain(config)
     blocks = {key: text for key in TEXTS if (text := plain["system"][key])}
     plain["system"].update(dict.fromkeys(blocks, PLACE))

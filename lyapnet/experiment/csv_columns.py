@@ -9,7 +9,7 @@ from pathlib import Path
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file
 
-LARGEST_CSV = 10_000_000  # bytes
+LARGEST_CSV = 10_000_000  # largest file, in bytes
 MOST_ROWS = 10_000
 
 
@@ -22,9 +22,9 @@ def read_columns(
     """Name ↦ numbers of each column.
 
     Args:
-        most_rows: most rows of numbers.
+        most_rows: largest number of rows of numbers.
         largest: largest file, in bytes.
-        advice: what the first row has to say, for messages.
+        advice: the required content of the first row, for messages.
 
     Raises:
         UsageError: no such file, no names, a name twice, a row of another length, or an entry that is no finite number;
@@ -42,7 +42,7 @@ def read_columns(
         ) from error
     try:
         read = (row for row in csv.reader(io.StringIO(text), skipinitialspace=True) if row)
-        rows = list(islice(read, most_rows + 2))  # one more than there may be
+        rows = list(islice(read, most_rows + 2))  # one more than allowed
     except csv.Error as error:
         raise UsageError(f"Expected a CSV file, got {str(path)!r} ({error}); separate numbers by commas.") from error
     names = [name.strip() for name in rows[0]] if rows else []

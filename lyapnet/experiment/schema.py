@@ -218,10 +218,10 @@ def _numbers_to_lists(content: Mapping[str, Any], schema: type, prefix: str = ""
 
 
 def _drop_replaced(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
-    """Remove what a later layer replaces and a merge would keep beside it.
+    """Remove values that a later layer replaces and that a merge would keep in addition.
 
-    That is a list for a mapping or the other way round, in fields that accept both, and in a mapping the same name with
-    another spelling of its spaces.
+    These are lists that a mapping replaces, or mappings that a list replaces, and entries of a mapping whose name
+    occurs again with another spelling of its spaces.
     """
     found = dict(content)
     for f in dataclasses.fields(schema):  # pyright: ignore

@@ -1,4 +1,4 @@
-"""Closed loops on plants that differ from the model: parameters are drawn at random, and the law is not told them."""
+"""Closed loops on plants that differ from the model: with random parameters that the law does not know."""
 
 import torch
 from jaxtyping import Float
@@ -42,7 +42,7 @@ class NominalValue(ValueFunction):
 
 
 class NominalLaw(ValuePolicy):
-    """u(t, x), a law made with the model, as a law of (x, p) that does not depend on the parameters p.
+    """u(t, x), a law for the model, as a function of (x, p) that does not depend on the parameters p.
 
     Args:
         problem: the problem of the plants, with the states (x, p).
@@ -70,7 +70,7 @@ def append_zeros(slope: Tensor, z: Tensor) -> Tensor:
 
 
 class RandomPlants(nn.Module):
-    """x₀ ↦ the closed loop on a plant with random parameters, uniform in their ranges, under a law made with the model.
+    """x₀ ↦ the closed loop on a plant with random parameters, uniform in their ranges, under a law for the model.
 
     Args:
         problem: the problem of the plants: a FamilySystem, whose X₀ includes the ranges of the parameters.

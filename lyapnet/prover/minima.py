@@ -36,7 +36,7 @@ from lyapnet.prover.elementary_functions import Elementary, square
 from lyapnet.prover.taylor import EPSILON, TINY, TaylorForm
 from lyapnet.task.ball import ControlBall
 from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts, SeparableCost
-from lyapnet.task.cost.minimum import LEAST, Known, known_as, least_over
+from lyapnet.task.cost.minimum import LEAST, Known, find_registered, least_over
 from lyapnet.task.sets import ControlSet, Unbounded
 
 Vectors = Float[Tensor, "boxes m"]
@@ -114,7 +114,7 @@ def least(W: Any, b: Any, named: str) -> TaylorForm:
         b: (m,), a form or constant.
     """
     b = b if isinstance(b, TaylorForm) else taylor.constant_form(b, W)
-    costs, controls = known_as(named, b.radius.device)
+    costs, controls = find_registered(named, b.radius.device)
     if isinstance(W, Tensor):
         try:
             u, h = closed_minimum(_ByForms(), Known(costs, controls), W, _numbers(b))

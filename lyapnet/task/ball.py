@@ -10,8 +10,8 @@ from lyapnet.task.sets import ControlSet, passed_through
 
 NEWTON_STEPS = 10  # number of steps for a multiplier; they converge monotonically and quadratically
 TINY = 1e-100  # replaces 0 in denominators
-LEAST_NUMBER = 1e-12  # least weight or limit that is accepted, and inverse of the largest
-INWARDS = 8  # units of rounding by which projected controls are inside; those inside by half of it stay as they are
+LEAST_NUMBER = 1e-12  # least weight or limit that is accepted; its inverse is the largest
+INWARDS = 8  # units of rounding by which projected controls are inside; controls inside by half of it are not moved
 
 
 class ControlBall(ControlSet):
@@ -55,7 +55,7 @@ class ControlBall(ControlSet):
         return self._inwards(u, self.rounding) if self.rounding > torch.finfo(u.dtype).eps else u
 
     def project(self, u: Control) -> Control:
-        """u, or r u/‖u‖ up to rounding, which is inwards."""
+        """u, or r u/‖u‖ rounded inwards."""
         return self._inwards(u, torch.finfo(u.dtype).eps)
 
     def _inwards(self, u: Control, unit: float) -> Control:
@@ -87,7 +87,7 @@ def minimise_in_ball(R: ControlMatrix, b: Control, radius: Tensor | None, weight
     Source: Moré, Sorensen, "Computing a trust region step", SIAM Journal on Scientific and Statistical Computing 1983.
     """
     given, R, b = b, R.double(), b.double()
-    size, largest = norm(b), 2 * R.abs().sum(-1).amax(-1)  # of b; at least the largest eigenvalue of 2R
+    size, largest = norm(b), 2 * R.abs().sum(-1).amax(-1)  # ‖b‖; a bound of the largest eigenvalue of 2R
     moves = size > (0.0 if weight is None else weight)
     b, size = torch.where(moves[..., None], b, 1.0), torch.where(moves, size, 1.0)
     multiplier = torch.zeros_like(size)

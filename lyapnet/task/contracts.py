@@ -1,4 +1,4 @@
-"""What the functions of a problem's parts return: the shape of each result, checked before anything is computed."""
+"""The shapes of results of a problem's functions, checked before anything is computed."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -54,7 +54,7 @@ def check_shapes_of_system(system: ControlSystem, x: State) -> None:
     Raises:
         UsageError: one is wrong; says which one, and its shape.
     """
-    x = x.detach().clone().requires_grad_()  # NumPy, which has no slope, refuses it
+    x = x.detach().clone().requires_grad_()  # code in NumPy, which has no derivatives, refuses it
     for contract in contracts_of_system(system):
         contract.check(x)
     dynamics = Contract(f"{type(system).__name__}.dynamics(x, u)", system.dynamics, (system.n,))

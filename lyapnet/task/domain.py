@@ -2,7 +2,7 @@
 
 Beyond a border a logarithm, a root or a power is NaN, and a single NaN spoils a whole gradient. Therefore the functions
 of a task with a domain are evaluated at the nearest state just inside, where they and their slopes are finite, and
-leaving the domain costs a price that grows with the distance. A task without such borders has no domain.
+leaving the domain has a cost, the price, which grows with the distance. A task without such borders has no domain.
 """
 
 import copy
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lyapnet.base.types import ControlMatrix, PerState, State, StatePath
-from lyapnet.task.cost import Cost, MadeOfAnother, PenaltyCost, SmoothedCost
+from lyapnet.task.cost import Cost, CostWrapper, PenaltyCost, SmoothedCost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem, ControlSystem
 
@@ -130,7 +130,7 @@ def _restrict(system: ControlSystem, domain: Domain) -> ControlSystem:
     return system
 
 
-class DomainCost(MadeOfAnother):
+class DomainCost(CostWrapper):
     """Another cost, evaluated at the nearest state of a domain, plus w · price(x) for each step outside.
 
     The terminal cost includes the price of one step. Inside the domain it equals the other cost.
@@ -150,7 +150,7 @@ class DomainCost(MadeOfAnother):
     def __init__(self, cost: Cost, domain: Domain, weight: float, step: float):
         super().__init__(cost)
         self.domain, self.weight, self.step = domain, weight, step
-        self.words = f"beyond {domain}: f, g, q and φ as just within, and what a state outside pays"
+        self.words = f"beyond {domain}: f, g, q and φ of the nearest state inside, plus a cost of the distance"
 
     def state(self, x: State) -> PerState:
         return self.cost.state(self.domain.nearest(x)) + self.weight / self.step * self.domain.price(x)
@@ -239,7 +239,7 @@ def find_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, n
 
 
 def _is_finite(values: Tensor) -> Tensor:
-    """Whether each of a batch of values (k, …) is finite; what is expanded from one of them is looked at once."""
+    """Whether each of a batch of values (k, …) is finite; values expanded from one are tested once."""
     different = values[:1] if values.stride(0) == 0 else values
     return different.isfinite().flatten(1).all(-1).expand(len(values)) if values.ndim > 1 else values.isfinite()
 

@@ -15,7 +15,7 @@ from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.sets import finite_numbers
 from lyapnet.task.systems import ControlSystem
 
-ROUNDING = 16  # units of rounding by which controls are inside, times `spread`
+ROUNDING = 16  # units of rounding by which controls are moved inside, times `spread`
 LARGEST_CONDITION = 1e5  # largest condition number of H; float32 has about 7 digits
 
 

@@ -13,7 +13,7 @@ from lyapnet.task.systems import ControlSystem
 
 
 class ExtendedSystem(ControlSystem):
-    """ẋ = f(x; s) + g(x; s)u with further states s, which no control moves; constant unless `rates` says otherwise.
+    """ẋ = f(x; s) + g(x; s)u with further states s independent of u; constant unless a subclass has other `rates`.
 
     Args:
         system: f and g.

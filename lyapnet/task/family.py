@@ -46,7 +46,7 @@ class FamilySystem(ExtendedSystem):
         system: f and g.
         names: names of the parameters, (k,).
         units: units of p.
-        weights: those of the names that are weights of the cost; their entries of p are logarithms.
+        weights: the names among these that are weights of the cost; their entries of p are logarithms.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class InterpolatedTargets(Targets):
 class FamilyCost(Cost):
     """The cost of each member: q and φ of x − (x*(p) − x*(p̄)), u counted from u*(p), and R(x) or R(x; p).
 
-    With a reference it is that at each time on it, p = (τ,).
+    With a reference, p = (τ,) is the time on it.
 
     Args:
         cost: q, R, φ and u* at p̄, functions of x.
@@ -250,18 +250,18 @@ class FamilyCost(Cost):
 
 
 def family_cost_of(cost: Any) -> FamilyCost:
-    """The cost of a family, of which another may be made."""
+    """The FamilyCost inside a cost."""
     while not isinstance(cost, FamilyCost):
         cost = cost.cost
     return cost
 
 
 def with_constant_states(problem: Problem, system: ControlSystem, initial_states: Box) -> Problem:
-    """A problem in z = (x, p), with constants p that only its system knows; all else is that of x.
+    """A problem in z = (x, p), with constants p on which only the system depends.
 
     Args:
-        problem: that in x.
-        system: that of z.
+        problem: the problem in x.
+        system: the system in z.
         initial_states: X₀ × P.
     """
     n, center = problem.system.n, initial_states.center

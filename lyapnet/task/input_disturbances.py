@@ -56,13 +56,13 @@ class NoiseOfFirstStates(NoiseOfTask):
 
 
 def with_input_disturbances(problem: Problem, controls: Sequence[int], deviations: Sequence[float]) -> Problem:
-    """The problem in (x, d): the cost, the controls and the constraints of x, and X₀ with d between −√3 and √3 σ_d.
+    """The problem in (x, d), with the cost, controls and constraints of x, and d in X₀ between −√3σ_d and √3σ_d.
 
-    A uniform distribution between these has the standard deviation σ_d.
+    The uniform distribution in this interval has the standard deviation σ_d.
 
     Args:
         controls: indices of the disturbed controls.
-        deviations: σ_d, the standard deviation of each disturbance at first, in the unit of its control.
+        deviations: σ_d, the initial standard deviation of each disturbance, in the unit of its control.
     """
     n, box, k = problem.system.n, problem.initial_states, len(controls)
     reach = 3**0.5 * box.lower.new_tensor([*deviations])

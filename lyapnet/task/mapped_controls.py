@@ -1,11 +1,10 @@
 """Control sets that are images of a simpler set at each state: u = c(x) + H(x)v for all v of a box or a ball.
 
-A task with such a set is solved for v, the shares. It is then a task with the simpler set, which is constant:
+A task with such a set is solved for v, the shares, as a task with the simpler, constant set:
 
     f + gu = (f + gc) + (gH)v,   (u − u*)ᵀR(u − u*) = (v − v*)ᵀ HᵀRH (v − v*),   v*(x) = H(x)⁻¹(u* − c(x)).
 
-So derivatives of dynamics and costs in x include those of c and H, and minimisers over the set are those of the simpler
-one.
+Derivatives of dynamics and costs in x then include those of c and H, and minimisers are those over the simpler set.
 """
 
 import copy
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import Control, ControlMatrix, InputMatrix, State
-from lyapnet.task.cost import Cost, MadeOfAnother
+from lyapnet.task.cost import Cost, CostWrapper
 from lyapnet.task.extended_system import ExtendedSystem
 from lyapnet.task.sets import ControlSet
 from lyapnet.task.systems import ControlSystem
@@ -76,7 +75,7 @@ class MappedSystem(ExtendedSystem):
         return self.system.dynamics(x, self.controls.moved(x, u))
 
 
-class MappedCost(MadeOfAnother):
+class MappedCost(CostWrapper):
     """Another cost as a function of the shares: q(x) + (v − v*(x))ᵀ HᵀRH (v − v*(x)).
 
     Args:
@@ -112,7 +111,7 @@ class MappedCost(MadeOfAnother):
 
 
 def mapped(system: ControlSystem, cost: Cost, controls: MappedControls, goal: State) -> tuple[ControlSystem, Cost]:
-    """A system and a cost as functions of the shares; those that are so already are returned unchanged.
+    """A system and a cost as functions of the shares; such a system or cost is returned unchanged.
 
     Args:
         goal: a typical state (n,), for costs without a goal.
@@ -120,7 +119,7 @@ def mapped(system: ControlSystem, cost: Cost, controls: MappedControls, goal: St
     if not isinstance(system, MappedSystem):
         system = MappedSystem(system, controls)
     inner = cost
-    while isinstance(inner, MadeOfAnother) and not isinstance(inner, MappedCost):
+    while isinstance(inner, CostWrapper) and not isinstance(inner, MappedCost):
         inner = inner.cost
     if not isinstance(inner, MappedCost):
         cost = MappedCost(cost, controls, goal if cost.goal is None else cost.goal.to(goal), system.m)
@@ -128,15 +127,15 @@ def mapped(system: ControlSystem, cost: Cost, controls: MappedControls, goal: St
 
 
 def written_system(system: ControlSystem) -> ControlSystem:
-    """The system as a function of u from which a system with shares was made; else the system itself."""
+    """The system as a function of u; for a MappedSystem the one inside it."""
     return system.system if isinstance(system, MappedSystem) else system
 
 
 def written_cost(cost: Cost) -> Cost:
-    """The cost as a function of u from which a cost with shares was made; else the cost itself."""
+    """The cost as a function of u; for a MappedCost the one inside it."""
     if isinstance(cost, MappedCost):
         return cost.cost
-    if not isinstance(cost, MadeOfAnother) or (inner := written_cost(cost.cost)) is cost.cost:
+    if not isinstance(cost, CostWrapper) or (inner := written_cost(cost.cost)) is cost.cost:
         return cost
     cost = copy.copy(cost)  # shares its tensors
     cost._modules = {**cost._modules, "cost": inner}

@@ -45,7 +45,7 @@ class Noise(nn.Module, ABC):
 
 
 class StateNoise(Noise):
-    """A Wiener process of its own for some states: σ is constant, with one column for each noisy state.
+    """Independent Wiener processes for some states: σ is constant, with one column for each noisy state.
 
     Args:
         strengths: standard deviation of each state per √s, (n,); 0 for a state without noise.
@@ -78,10 +78,10 @@ class SystemNoise(Noise):
 
     Args:
         system: the system.
-        like: a state (n,), at which the number of sources is read off.
+        like: a state (n,), at which the number of sources is determined.
 
     Raises:
-        UsageError: the method fails, or returns no matrix with a column.
+        UsageError: the method fails, or does not return a matrix with at least one column.
     """
 
     def __init__(self, system: ControlSystem, like: State):
@@ -102,5 +102,5 @@ class SystemNoise(Noise):
 
 
 def once_if_constant(sigma: NoiseMatrix) -> Tensor:
-    """σ with axes of length one for those of the batch along which it is expanded, so that it enters products once."""
+    """σ with length one instead of expanded batch axes, so that products with it are computed once."""
     return sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]

@@ -117,7 +117,7 @@ class OperatingPoints:
         return None
 
     def to_move(self, x: State, given: Mapping[int, float]) -> list[int]:
-        """The components of an almost held state that should change so that it is held: few ones, with many digits.
+        """The components to change in an almost held state so that it is held: few, and those given with many digits.
 
         They minimise Σ w_i |Δx_i| / extent_i to first order, a linear program with a sparse solution. The weight w_i is
         10⁻ᵈ for a component given with d digits, because 15 is probably exact and 0.4541 rounded, and 0 if not given.
@@ -139,7 +139,7 @@ class OperatingPoints:
         return [i for i in range(n) if i not in given or move[i] > 1e-14 * max(1.0, move.max())]
 
     def is_rounding(self, given: Mapping[int, float], after: State) -> bool:
-        """Whether given components changed by no more than rounding: half a unit of their last digit, and little of X₀.
+        """Whether given components changed by rounding: at most half a unit of their last digit, and little of X₀.
 
         A component with one digit may only change by ALWAYS_ALLOWED_MOVE.
         """
@@ -210,7 +210,7 @@ class OperatingPoints:
         equations = _Equations(self, start, kept, about, bounded)
         try:
             y = equations.solve()
-        except (ValueError, np.linalg.LinAlgError):  # f or its slope is not finite where it leads
+        except (ValueError, np.linalg.LinAlgError):  # f or its slope is not finite on the way
             return None, True
         return self._point(*equations.parts(y)), equations.isolated(y)
 

@@ -23,7 +23,7 @@ class Outputs(nn.Module, ABC):
         noise: standard deviation of each reading, in its unit.
 
     Raises:
-        ValueError: there is none, or one is not positive and finite.
+        ValueError: there is no reading, or a deviation is not positive and finite.
     """
 
     names: Sequence[str]
@@ -54,9 +54,9 @@ class Outputs(nn.Module, ABC):
         return h + self.noise.to(h) * torch.randn(h.shape, generator=generator, dtype=torch.float64).to(h)
 
     def surprise(self, y: Readings, expected: Readings) -> Readings:
-        """y − ŷ, of an angle the nearest to 0 of all that differ by turns of 2π; NaN stays where a reading is missing.
+        """y − ŷ, for angles modulo 2π in [−π, π]; NaN for a missing reading.
 
-        A reading that wraps at ±π, and one that counts turns, thus say the same.
+        Thus a reading that wraps at ±π and one that counts turns have the same effect.
         """
         difference = y - expected
         if not self.angles:
@@ -103,7 +103,7 @@ class SystemOutput(Outputs):
         x: states (b, n) at which the contract of h is checked, in float64.
 
     Raises:
-        UsageError: h breaks its contract; says how.
+        UsageError: h breaks its contract; states how.
     """
 
     def __init__(self, system: ControlSystem, noise: Sequence[float], x: State):

@@ -15,7 +15,7 @@ from lyapnet.task.sets import ControlSet, finite_numbers, passed_through
 
 MOST_CONTROLS = 4
 MOST_COMBINATIONS = 2000  # largest number of sets of rows; each takes a linear system for each state
-INWARDS = 16  # units of rounding by which controls are inside, relative to the sum of sizes of a row's terms
+INWARDS = 16  # units of rounding by which controls are moved inside, relative to the sum of sizes of a row's terms
 LEAST_WIDTH = 1e-4  # least radius of the largest ball in U, relative to U's size: far above rounding in float32
 SINGULAR = 1e-9  # singular value below which unit rows count as dependent
 ACTIVE = 1e-9  # distance of a control from a row, relative to the sum of sizes, below which the row is active
@@ -101,7 +101,9 @@ class ControlPolytope(ControlSet):
         A, sides, sizes = self.A.double(), self.within, self.sizes.double()
         m, known = b.shape[-1], R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         if m != A.shape[1]:
-            raise ValueError(f"Expected controls of {A.shape[1]}, as A has columns, got {m}; give one for each.")
+            raise ValueError(
+                f"Expected controls of {A.shape[1]}, the number of columns of A, got {m}; give one for each."
+            )
         each = (slice(None), *[None] * (b.ndim - 1))  # the first axis is that of the s sets of rows
         chosen = torch.cat([A, torch.zeros_like(A[:1])])[self.rows][each]  # (s, *1, m, m)
         held = torch.cat([sides, torch.zeros_like(sides[:1])])[self.rows][each]

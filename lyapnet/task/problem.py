@@ -30,7 +30,7 @@ from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem, functions_of_state
 
 GOAL_TEST_STEPS = 200  # largest number of steps in the test whether a task has a goal
-TRIED = 64  # states at which users' functions are tested
+TEST_STATES = 64  # number of states at which users' functions are tested
 LIMITS = {"lower limits": -1, "upper limits": 1}  # keys in a record ↦ sign of the infinity that means no limit
 RECORD_TOLERANCE = 1e-4  # relative to a component's largest entry: difference below which recorded numbers agree
 
@@ -48,8 +48,8 @@ class Response(NamedTuple):
 class Problem(nn.Module):
     """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U subject to ẋ = f(x) + g(x)u, h(x) ≤ 0, for all x₀ ∈ X₀.
 
-    With noise σ, dx = (f + gu) dt + σ(x) dW, and the expectation E J(x₀) is minimised; with a risk θ > 0 it is
-    (1/θ) log E exp(θ J(x₀)), for which dear paths count more. Methods about a step, such as `step` and `response`, are
+    With noise σ, dx = (f + gu) dt + σ(x) dW, and the expectation E J(x₀) is minimised; with a risk θ > 0 it is (1/θ)
+    log E exp(θ J(x₀)), for which expensive paths count more. Methods about a step, such as `step` and `response`, are
     about the step without noise.
 
     Args:
@@ -132,7 +132,7 @@ class Problem(nn.Module):
 
     @property
     def follows_reference(self) -> bool:
-        """Whether the goal moves with the time on a reference, which is a state."""
+        """Whether the goal moves along a reference; the time on it is then a state."""
         return self.system.reference_time is not None
 
     @property
@@ -152,9 +152,9 @@ class Problem(nn.Module):
     def _typical_states(self) -> State:
         """States (b, n) of X₀, and states reached from there by random constant controls in GOAL_TEST_STEPS steps."""
         generator = torch.Generator().manual_seed(0)
-        x = self.initial_states.sample(TRIED, generator)
-        self.check_shapes(x)  # wrong ones may broadcast, and grow by a factor in each step
-        u = self.controls.project(self.rest_at(x) + torch.randn(TRIED, self.system.m, generator=generator).to(x))
+        x = self.initial_states.sample(TEST_STATES, generator)
+        self.check_shapes(x)  # wrong shapes may broadcast, and then grow in each step
+        u = self.controls.project(self.rest_at(x) + torch.randn(TEST_STATES, self.system.m, generator=generator).to(x))
         states, N = [x], min(self.horizon.steps, GOAL_TEST_STEPS)
         for n in range(1, N + 1):
             x = self.step(x, u)[0]
@@ -198,7 +198,7 @@ class Problem(nn.Module):
 
     def smooth_rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The same without s(u), the cost of controls beside uᵀRu."""
-        own = self.cost.nonquadratic is None  # a cost of a user's may have `running` of its own
+        own = self.cost.nonquadratic is None  # a user's cost may override `running`
         running = self.cost.running if own else self.cost.smooth_running
         tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
         for row in tableau.a:
@@ -337,7 +337,7 @@ class Problem(nn.Module):
             return self
         box, horizon = self.initial_states, self.horizon
         domain = Domain(self.system.state_names, size_of(box), borders)
-        x = box.sample(TRIED, torch.Generator().manual_seed(0))
+        x = box.sample(TEST_STATES, torch.Generator().manual_seed(0))
         running, terminal = (part.abs().mean() for part in (self.cost.state(x), self.cost.terminal(x)))
         price = float(horizon.duration * running + terminal) or 1.0
         cost = DomainCost(self.cost, domain, price, horizon.dt)
@@ -357,17 +357,17 @@ class Problem(nn.Module):
         x = own.initial_states.sample(256, generator)
         if isinstance(own.controls, MappedControls):
             own.controls.check(x, m)
-        own.check_shapes(x[:TRIED])
+        own.check_shapes(x[:TEST_STATES])
         for contract in (*contracts_of_system(system), *contracts_of_cost(cost, m)):
-            check_function(contract.name, contract.function, [x[:TRIED]], contract.shape)
+            check_function(contract.name, contract.function, [x[:TEST_STATES]], contract.shape)
         if own.noise is not None:
-            check_function(f"{name}.noise(x)", own.noise, [x[:TRIED]], (n, own.noise.sources))
+            check_function(f"{name}.noise(x)", own.noise, [x[:TEST_STATES]], (n, own.noise.sources))
         cost.check(x)
         own._check_constraints(x)
         b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
         if not system.affine:
-            u = own.controls.project(b[:TRIED])
-            check_function(f"{name}.dynamics(x, u)", system.dynamics, [x[:TRIED], u], (n,))
+            u = own.controls.project(b[:TEST_STATES])
+            check_function(f"{name}.dynamics(x, u)", system.dynamics, [x[:TEST_STATES], u], (n,))
         elif not torch.allclose(system.dynamics(x, b), system.f(x) + apply(system.g(x), b), rtol=1e-6):
             raise UsageError(
                 f"Expected {name}.dynamics(x, u) = f(x) + g(x)u, got another sum; a class that overrides f or g of "
@@ -379,7 +379,9 @@ class Problem(nn.Module):
                 f"Expected {type(own.controls).__name__}.minimise(R, b) in the set, got a control outside, which "
                 "project(u) moves; correct one of them."
             )
-        check_memory(own.parts, lambda: own.call(x[:TRIED]), lambda: own.call(own.initial_states.ends(TRIED)))
+        check_memory(
+            own.parts, lambda: own.call(x[:TEST_STATES]), lambda: own.call(own.initial_states.ends(TEST_STATES))
+        )
 
     def check_shapes(self, x: State) -> None:
         """Check the shapes of f, g, ẋ, q, φ, R and of U's functions at states (b, n), in their precision, on the CPU.
@@ -415,7 +417,7 @@ class Problem(nn.Module):
         constraints, name = self.constraints, type(self.constraints).__name__
         if not constraints.names:
             raise UsageError(f"Expected {name}.names with a name for each component of h(x), got none; declare them.")
-        check_function(f"h(x) of {name}", constraints, [x[:TRIED]], (len(constraints.names),))
+        check_function(f"h(x) of {name}", constraints, [x[:TEST_STATES]], (len(constraints.names),))
         h = constraints(x)
         outside = (h > 0).any(-1)
         if bool(outside.any()):
@@ -434,8 +436,8 @@ class Problem(nn.Module):
         """
         name, generator = type(V).__name__, torch.Generator().manual_seed(0)
         own: Any = copied(V).eval()
-        x = self.initial_states.sample(TRIED, generator).double().cpu()
-        t = self.horizon.duration * torch.rand(TRIED, generator=generator, dtype=torch.float64)
+        x = self.initial_states.sample(TEST_STATES, generator).double().cpu()
+        t = self.horizon.duration * torch.rand(TEST_STATES, generator=generator, dtype=torch.float64)
         check_function(f"{name}.forward(t, x)", own, [t, x], ())
         both = f"{name}.value_and_state_gradient(t, x)"
         value, V_x = (
@@ -445,7 +447,7 @@ class Problem(nn.Module):
         leaf = x.clone().requires_grad_()
         with torch.enable_grad():
             (expected,) = torch.autograd.grad(own(t, leaf).sum(), leaf, materialize_grads=True)
-        ends = self.initial_states.ends(TRIED).double().cpu()
+        ends = self.initial_states.ends(TEST_STATES).double().cpu()
         check_memory(
             {name: own},
             lambda: own.value_and_state_gradient(t, x),
@@ -479,7 +481,7 @@ class Problem(nn.Module):
         if (rest := cost.rest_at(x)) is not None:
             numbers["u*"] = rest.expand(3, m)
         if cost.nonquadratic is not None:
-            numbers["s"] = cost.beside(cost.nonquadratic.told_apart(m))
+            numbers["s"] = cost.beside(cost.nonquadratic.distinguishing_controls(m))
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
         if own.noise is not None:

@@ -13,7 +13,7 @@ class TimedSystem(ExtendedSystem):
 
     Args:
         system: f and g.
-        period: of the reference; None: it does not repeat.
+        period: period of the reference; None: it is not periodic.
     """
 
     def __init__(self, system: ControlSystem, period: float | None):

@@ -131,7 +131,7 @@ class ControlSet(nn.Module, ABC):
     def limits(self) -> tuple[Tensor, Tensor] | None:
         """(lower, upper), each () or (m,), of the smallest box around U, as oracles and the initial V need it.
 
-        None if it is not known, and U is then no set that they take.
+        None if it is not known; oracles and the initial V then refuse U.
         """
         return None
 
@@ -150,7 +150,7 @@ class ControlSet(nn.Module, ABC):
         return self.limits
 
     def applied(self, x: State, u: Control) -> Control:
-        """The control that acts at x for an element u of U: u itself, unless U has shares, or a coarser rounding."""
+        """The control that acts at x for an element u of U: u, except for sets with shares or coarser rounding."""
         return u
 
     def moved(self, x: State, u: Control) -> Control:
@@ -158,7 +158,7 @@ class ControlSet(nn.Module, ABC):
         return u
 
     def asked(self, x: State, u: Control) -> Control:
-        """The element of ℝᵐ that a control at x stands for: the inverse of `moved`."""
+        """The element of ℝᵐ that corresponds to a control at x: the inverse of `moved`."""
         return u
 
     @property
@@ -206,7 +206,7 @@ def finite_numbers(name: str, given: Any) -> Tensor:
     """Finite numbers in float64, from nested lists of them.
 
     Raises:
-        ValueError: they are none; names them.
+        ValueError: the lists contain something else; names them.
     """
     try:
         numbers = torch.tensor(given, dtype=torch.float64)
@@ -446,9 +446,9 @@ def active_set(b: Control, R: ControlMatrix, low: Tensor, high: Tensor) -> Contr
     """Which controls are at a limit at the minimum: −1 at the lower, 1 at the upper, 0 at none.
 
     Each round moves from a control in the box towards the minimum over the free controls. If a limit is reached first,
-    that control is held from there on. Otherwise the held control is released whose release lowers the cost most. The
-    cost falls in each round; at the minimum no release gains. On random R and b with up to 8 controls and a condition
-    of R up to 1e6 this took at most 2.3m rounds; ACTIVE_SET_ROUNDS · m are made.
+    that control is held from there on. Otherwise, of the held controls, the one is released that lowers the cost most.
+    The cost decreases in each round; at the minimum no release lowers it. On random R and b with up to 8 controls and a
+    condition of R up to 1e6 this took at most 2.3m rounds; ACTIVE_SET_ROUNDS · m are made.
     """
     m, scale = b.shape[-1], R.diagonal(dim1=-2, dim2=-1).sqrt()
     each = torch.arange(m, device=b.device)
@@ -473,6 +473,6 @@ def _have_values(*tensors: Tensor) -> bool:
 
 ENUMERATED_CONTROLS = 4  # up to this number all combinations are tried: 3⁴ = 81 systems compile faster than many rounds
 ACTIVE_SET_ROUNDS = 4  # rounds of the active-set method for each control
-SIMULTANEOUS_ROUNDS = 8  # rounds in which all controls may change at once; as many for each control follow
+SIMULTANEOUS_ROUNDS = 8  # rounds in which all controls may change at once; then as many rounds for each control follow
 NEAR_BORDER = 1e-5  # excess below which a control is inside; on a border it is 0 up to rounding, also in float32
 FINITE_LIMIT = 1e150  # replaces an infinite limit in products

@@ -16,8 +16,8 @@ from lyapnet.task.mapped_controls import MappedControls
 from lyapnet.task.sets import ControlBox, finite_numbers, passed_through
 from lyapnet.task.systems import ControlSystem
 
-TRIED = 64  # number of states at which a user's function is tested
-ROUNDING = 16  # units of rounding by which limits are inside those of the table, relative to the sum of sizes
+TEST_STATES = 64  # number of states at which a user's function is tested
+ROUNDING = 16  # units of rounding by which limits are moved inside those of the table, relative to the sum of sizes
 
 
 class VaryingLimits(MappedControls, ControlBox):
@@ -48,7 +48,7 @@ class VaryingLimits(MappedControls, ControlBox):
         """
         raise ExportError(
             f"Expected limits of controls from a table, or the precision of the controller, got "
-            f"{type(self).__name__}: in another precision u may pass them; take --dtype of the controller."
+            f"{type(self).__name__}: in another precision u may exceed them; take --dtype of the controller."
         )
 
     def moved(self, x: State, u: Control) -> Control:
@@ -77,14 +77,14 @@ class VaryingLimits(MappedControls, ControlBox):
         """
         name = type(self).__name__
         for k in (0, 1):
-            check_function(f"{name}.limits_at(x)[{k}]", lambda x, k=k: self.limits_at(x)[k], [x[:TRIED]], (m,))
+            check_function(f"{name}.limits_at(x)[{k}]", lambda x, k=k: self.limits_at(x)[k], [x[:TEST_STATES]], (m,))
         lower, upper = self.limits_at(x)
         bad = torch.nonzero(~((lower < upper) & lower.isfinite() & upper.isfinite()).all(-1)).flatten()
         if len(bad):
             i = int(bad[0])
             raise UsageError(
                 f"Expected finite limits with lower < upper, got {lower[i].tolist()} and {upper[i].tolist()} of {name} "
-                f"at x = {x[i].tolist()}; leave every control some room at every state."
+                f"at x = {x[i].tolist()}; leave an interval for every control at every state."
             )
 
     def extra_repr(self) -> str:
@@ -101,7 +101,7 @@ class LimitTable(VaryingLimits):
         state: the name of the state.
         at: its values x₀ < … < x_k, in its unit.
         upper: the greatest controls there: k + 1 numbers, or rows of one for each control.
-        lower: the least controls there, likewise; None: −upper.
+        lower: the least controls there, in the same form; None: −upper.
 
     Raises:
         ValueError: a table of another form, values that do not increase, or lower ≥ upper.

@@ -1,4 +1,4 @@
-"""Returns a training that has become worse to its best weights, with a smaller learning rate."""
+"""A callback that returns to the best weights, with a smaller learning rate, when a training becomes worse."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,12 +21,12 @@ COMPARED_SHARE = 0.9  # share of validation states, the cheapest, in that cost; 
 
 @dataclass
 class Best:
-    """The best weights of a member so far, with what is needed to train on from them."""
+    """The best weights of a member so far, with the state needed to continue from them."""
 
     loss: float = math.inf  # least validation loss
     step: int = 0
     cost: float = math.inf  # mean cost of the validation states
-    cheapest: float = math.inf  # that of the cheapest COMPARED_SHARE of them
+    cheapest: float = math.inf  # mean cost of the cheapest COMPARED_SHARE of them
     weights: dict[str, Tensor] = field(default_factory=dict)
     optimizer: list[dict[str, Any]] = field(default_factory=list)  # state of the optimizer for each parameter of V
     worse_since: int | None = None  # first of the last consecutive validations that were worse
@@ -36,11 +36,11 @@ class Best:
 class ReturnToBest(Callback):
     """Returns a member to its best weights if its closed loops cost more, during or at the end of its training.
 
-    The best weights are those of the least validation loss, as in best.ckpt. Training is worse where the mean cost of
-    the validation states exceeds theirs by more than WORSE_BY. After WORSE_FOR steps of this, or at once if the
-    cheapest COMPARED_SHARE of the states cost DIVERGENCE_COST_RATIO times as much, weights and optimizer return to
-    their best state, and the learning rate becomes a third. After its last step a member that is worse has its best
-    weights: a resumed or fine-tuned run starts from there.
+    The best weights are those of the least validation loss, as in best.ckpt. Training is worse if the mean cost of the
+    validation states exceeds that of the best weights by more than WORSE_BY. After WORSE_FOR steps of this, or at once
+    if the cheapest COMPARED_SHARE of the states cost DIVERGENCE_COST_RATIO times as much, weights and optimizer return
+    to their best state, and the learning rate becomes a third. A member that is worse after its last step gets its best
+    weights, from which a resumed or fine-tuned run starts.
 
     Without a goal costs are relative to the spread of V(0, x₀), under noise to that of the costs if it is larger:
     V(0, x₀) may be nearly the same on all of X₀.
@@ -71,7 +71,7 @@ class ReturnToBest(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for member, group in zip(members_of(pl_module), trainer.optimizers[0].param_groups, strict=True):
-            if member.measured_at == trainer.global_step:  # its training has not ended before
+            if member.measured_at == trainer.global_step:  # its training had not ended earlier
                 self._compare(trainer, member, group)
 
     def _compare(self, trainer: Trainer, member: Learner, group: dict[str, Any]) -> None:
@@ -110,7 +110,7 @@ class ReturnToBest(Callback):
         if not ends:
             best.rate_share = member.rate_share = best.rate_share / RATE_DIVISOR
             group["lr"] /= RATE_DIVISOR
-            what = f"it goes on from there, with {best.rate_share:.2g} of the scheduled learning rate"
+            what = f"training continues from there, with {best.rate_share:.2g} of the scheduled learning rate"
         if trainer.is_global_zero:
             named = f" of {member.label.replace('_', ' ')}" if member.label else ""
             self.say(f"worse: the validation states{named} {because}; {what}")

@@ -98,7 +98,7 @@ class InitialStateDataModule(L.LightningDataModule):
 
 
 class EnsembleDataModule(InitialStateDataModule):
-    """Batches (E, b, n): for each of the seeds seed, seed + 1, … the batch of a run with that seed alone.
+    """Batches (E, b, n): for each of the seeds seed, seed + 1, … the batch of a run with only that seed.
 
     Args:
         seeds: E, the number of seeds.

@@ -57,7 +57,7 @@ def train(
     Args:
         config: a YAML file, its content as nested dictionaries, or a Config.
         overrides: changes to the config, as key.sub=value.
-        resume: "last", or the path of a checkpoint: continue that run. A finished run is left as it is.
+        resume: "last", or the path of a checkpoint: continue that run. A finished run is not changed.
         finetune: a checkpoint with the initial weights of a new run.
         console: shows the progress; None: the terminal, or in a notebook the output of the cell, as plain text.
         parts: the user's objects, used instead of those that the config names; these are then not imported.
@@ -148,7 +148,7 @@ def _fit(plan: Plan, console: Console) -> dict[str, Any]:
 
 
 def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None) -> L.Trainer:
-    """Train all iterations, going back to a checkpoint after a divergence; returns the trainer that finished."""
+    """Train all iterations, returning to a checkpoint after a divergence; returns the trainer that finished."""
     returns, module = Returns(plan, console, start), plan.module
     while True:
         torch.manual_seed(plan.config.seed)  # for users' networks; lyapnet draws from streams of its own
@@ -206,7 +206,9 @@ def _switch_to_lookahead(plan: Plan, console: Console, is_first_process: bool) -
     plan = under_policy(plan, "lookahead")
     if is_first_process:
         write_atomically(plan.run.folder / CONFIG, to_yaml(plan.config).encode())
-        console.print("law: lookahead is trained from here on; rollout.policy=sampled keeps the other", soft_wrap=True)
+        console.print(
+            "law: training continues with lookahead; rollout.policy=sampled keeps the other law", soft_wrap=True
+        )
     return plan
 
 

@@ -77,7 +77,7 @@ class TrainingModule(L.LightningModule):
     def validate_on(self, x0: Tensor) -> list[Tensor]:
         """Fill each member's table `validation` and return the validation losses.
 
-        The validation states are always the same: once its training has ended, a member is measured no more.
+        The validation states are always the same: a member is no longer measured once its training has ended.
         """
 
         def validate(member: Learner, states: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ class TrainingModule(L.LightningModule):
         if strict and missing:
             raise CheckpointError(f"Expected weights {', '.join(missing[:6])}, got none; use the same network.")
         further = [name for name in state_dict if name not in wanted.values() and "closed_loop." not in name]
-        if strict and further:  # version 0.1 kept V under closed_loop too
+        if strict and further:  # version 0.1 stored V under closed_loop too
             raise CheckpointError(f"Expected no weights {', '.join(further[:6])}, got some; use the same network.")
         known = {key: state_dict[name] for key, name in wanted.items() if name in state_dict}
         return super().load_state_dict(known, strict=False, assign=assign)
@@ -241,7 +241,7 @@ def _compile_alike(rollouts: Sequence[Rollout], batch_size: int) -> None:
         return
     first, *others = loops
     X0 = rollouts[0].problem.initial_states
-    # off the centre, which may be a goal, where V is rounding and compiled code may have another one
+    # not at the centre, which may be a goal, where V is only rounding and compiled code may round differently
     first.compile(((X0.center + X0.upper) / 2).expand(batch_size, -1).contiguous())
     for loop in others:
         if not loop.share_code(first, X0.sample(batch_size, torch.Generator().manual_seed(0))):

@@ -26,8 +26,8 @@ from lyapnet.value.expansions import (
 OPTIMA = 24  # number of optimal trajectories, from random states of X₀
 FIRST_WEIGHT = 1e-2  # smallest weight, in units of the mean cost per second
 WEIGHT_FACTOR = 10**0.25  # ratio of successive weights
-MAX_WEIGHTS = 60  # number of weights, at most
-STALL_WEIGHTS = 8  # larger weights that must not move h: a factor of 100
+MAX_WEIGHTS = 60  # largest number of weights
+STALL_WEIGHTS = 8  # number of consecutive weights, a factor of 100, that must not move h for the search to end
 STALL_TOLERANCE = 1e-2  # change of h, in units of the margin, that counts as no movement
 MARGIN_RESERVE = 0.5  # share of the margin that optima must leave free for the error of a trained law
 

@@ -84,7 +84,9 @@ def plan_run(
         LyapnetError: the folder of a new run cannot be made.
     """
     if resume and finetune:
-        raise UsageError("Expected --resume or --finetune, got both; resume goes on, finetune starts a new run.")
+        raise UsageError(
+            "Expected --resume or --finetune, got both; resume continues a run, finetune starts a new one."
+        )
     check_training_sizes(config)
     check_trainer_options(config)
     require_libraries(config.loggers)
@@ -151,7 +153,7 @@ def _read_to_resume(checkpoint: Path, run: TrainingRun) -> dict[str, Any]:
     except LyapnetError as error:
         if checkpoint != run.last or not run.best.is_file():
             raise
-        raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
+        raise type(error)(f"{error} The best one is readable: continue from it with --resume {run.best}.") from error
 
 
 def _restart(run: TrainingRun, config: Config, parts: Parts, module: TrainingModule) -> None:

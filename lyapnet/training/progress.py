@@ -30,7 +30,7 @@ class TrainingProgress(ProgressBar):
     The bar also shows the remaining time.
 
     Args:
-        stages: shows what is done before the first step, and the steps where there is no terminal.
+        stages: shows the work before the first step, and the steps if there is no terminal.
     """
 
     def __init__(self, stages: StageMessages):

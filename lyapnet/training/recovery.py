@@ -1,4 +1,4 @@
-"""Recovery from losses that are not finite: training goes back to its last checkpoint with a smaller rate."""
+"""Recovery from losses that are not finite: training returns to its last checkpoint with a smaller learning rate."""
 
 import copy
 from dataclasses import replace
@@ -77,10 +77,10 @@ class Returns:
     def _diagnose_before_first_step(self) -> str:
         """Describe a divergence before the first step, which the learning rate cannot have caused."""
         member: Learner = self.plan.module.members[0]
-        tried = "no step was taken yet, so that no learning rate mends it"
+        tried = "no step was taken yet, so that the learning rate is not the cause"
         if (slope := infinite_slope(member)) is not None:
             return f"{tried}: {slope}; {TO_WRITE}."
-        otherwise = " Look at f, g and the cost where closed loops lead, or choose a smaller Δt or X₀."
+        otherwise = " Check f, g and the cost along closed loops, or choose a smaller Δt or X₀."
         return f"{tried}.{self._describe_cause() or otherwise}"
 
     def _diagnose(self) -> str:

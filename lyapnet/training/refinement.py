@@ -44,7 +44,7 @@ def refine(
 
     Args:
         certified: computes the certificate of a checkpoint's controller, a funnel or a region.
-        parts: the user's objects of which it is made; nothing else that a checkpoint names is imported.
+        parts: the user's objects of the controller; nothing else that a checkpoint names is imported.
 
     Raises:
         UsageError: a checkpoint names an object that `parts` lacks, or callbacks that the overrides do not name.
@@ -132,5 +132,5 @@ def _require_named_callbacks(config: Config, overrides: Sequence[str]) -> None:
         listed = ",".join(config.callbacks)
         raise UsageError(
             f"Expected callbacks named by the command, got {listed} from a checkpoint's config; append "
-            f"callbacks=[{listed}] to train on with them, or callbacks=[] to do without."
+            f"callbacks=[{listed}] to continue with them, or callbacks=[] to continue without."
         )

@@ -14,7 +14,7 @@ from lyapnet.training.stage_messages import StageMessages
 
 WINDOW = 40  # steps in which the validation loss has to fall
 COOLING = 40  # steps of the final decay of the learning rate
-NOISE_FACTOR = 5.0  # largest distance of the window's mean loss from the least loss, in units of the least gain
+NOISE_FACTOR = 5.0  # largest distance of the window's mean loss from the least loss, in units of `least_gain`
 PATIENCE = 120  # steps without a lower loss after which even an oscillating loss has stopped falling
 
 
@@ -85,7 +85,7 @@ class Settling(Callback):
         losses = self.losses[label]
 
         def fell_by(steps: int, first: int) -> float:
-            """How far the least loss of the last `steps` steps is below the least one between `first` and these."""
+            """By how much the least loss of the last `steps` steps is below the least one from `first` until then."""
             before = [loss for at, loss in losses if first <= at <= step - steps]
             since = [loss for at, loss in losses if at > step - steps]
             return min(before, default=math.inf) - min(since)

@@ -44,13 +44,13 @@ from lyapnet.value.linearisation import (
     smoothed_part,
 )
 
-NAMED_CONTROLS = 4  # largest number of controls whose limits are told by name
+NAMED_CONTROLS = 4  # largest number of controls whose limits are printed by name
 STEP_GAIN = "step gain"  # name of a fact
 STABLE_GAIN = 2.0  # largest gain Δt λ of the HJB law for which Euler steps do not oscillate and grow
 REACHABILITY_TOLERANCE = 1e-10  # relative to A in scaled units: larger entries count as coupling of two states
 EIGENVALUE_TOLERANCE = 1e-8  # relative to the largest eigenvalue or A: smaller real and imaginary parts count as zero
-OBSERVED_LOOPS = 16  # closed loops along which it is tested whether outputs tell the state
-VAGUE = 0.5  # share of the uncertainty of x₀ that is left at T, above which the outputs do not tell a state
+OBSERVED_LOOPS = 16  # closed loops along which it is tested whether outputs determine the state
+VAGUE = 0.5  # share of the uncertainty of x₀ that remains at T, above which the outputs do not determine a state
 CONVEX = "convex"  # name of a fact
 CONVEXITY_LOOPS, CONVEXITY_NODES, CONVEXITY_CONTROLS = 64, 8, 32  # loops, nodes of each and controls that are tried
 DOMAIN_TEST_STATES = 64  # states of X₀ whose closed loops are checked against the domain
@@ -70,7 +70,7 @@ def facts_of(
         report: called with each stage of the work.
         known: called with each fact as soon as it is known.
         may_look_ahead: whether training may replace the sampled law by the lookahead law.
-        outputs: what is measured of the state; None: the state itself.
+        outputs: the outputs that are measured; None: the state.
     """
     problem, facts = learner.problem, list[Fact]()
 
@@ -89,7 +89,7 @@ def facts_of(
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
         elif exact.follows_reference:
-            tell(Fact("reference", "followed at no cost by the control that the cost counts u from"))
+            tell(Fact("reference", "the control u_r, about which controls cost nothing, follows it"))
         elif (around := linearised(exact)).missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
@@ -120,10 +120,10 @@ def facts_of(
 
 
 def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[Fact]:
-    """Whether the outputs of a config tell the state along closed loops of the start; none without outputs.
+    """Whether the outputs of a config determine the state along closed loops of the start; empty without outputs.
 
-    The process noise of states that move is not held against the outputs: how far it drives them in a step is no matter
-    of X₀. What is constant in the model, parameters and disturbances, is known no better than its walk leaves it.
+    Process noise of moving states is left out, because its effect in a step does not depend on the outputs. For states
+    that are constant in the model, parameters and disturbances, their random walk limits what can be known.
     """
     if config is None or (parts := estimator_parts(config, in_float64(learner.problem))) is None:
         return []
@@ -138,7 +138,7 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
     x, u = path.x[:, rows], path.u[:, rows]
     system = problem.system
     found = observability(ExtendedKalmanFilter(problem, outputs, drift), x, u, deviation)
-    fixed = problem.initial_states.widths == 0  # their deviation is no more than a convention
+    fixed = problem.initial_states.widths == 0  # their deviation is only a convention
     usual = torch.where(fixed, deviation.maximum(x.flatten(0, 1).std(0)), deviation)
     estimated = [(i, name) for i, name in enumerate(system.state_names) if i not in system.settings]
     vague = [name for i, name in estimated if found.of_first[i] > VAGUE * usual[i]]
@@ -170,7 +170,7 @@ def observability_facts(learner: Learner, config: OutputsConfig | None) -> list[
 
 @torch.no_grad()
 def convexity_facts(problem: Problem, V: ValueFunction, law: nn.Module) -> list[Fact]:
-    """At which share of states along loops of the start ℓ + V_xᵀF(x, u) is not convex in u, if F is not affine in u.
+    """The share of states along loops of the start at which ℓ + V_xᵀF(x, u) is not convex in u, if F is not affine.
 
     Controls are drawn from U; without limits from a range three times as wide as that of the loops.
     """
@@ -214,7 +214,7 @@ def convexity_facts(problem: Problem, V: ValueFunction, law: nn.Module) -> list[
 
 
 def _domain_facts(learner: Learner) -> Iterator[Fact]:
-    """From how many states of X₀ closed loops leave the domain, and which constraints prevent it."""
+    """The number of states of X₀ whose closed loops leave the domain, and constraints that prevent it."""
     domain = learner.problem.domain
     if domain is None:
         return
@@ -238,7 +238,7 @@ def jump_facts(problem: Problem) -> list[Fact]:
     system, written = type(problem.system).__name__, type(cost).__name__
     with float64_defaults():
         return [
-            Fact("jumps", jump.told(name, problem.system.state_names), SLOPE)
+            Fact("jumps", jump.described(name, problem.system.state_names), SLOPE)
             for name, function in (
                 *((f"{system}.{name}", function) for name, function in problem.functions_of_state.items()),
                 (f"q(x) of {written}", cost.state), (f"φ(x) of {written}", cost.terminal),
@@ -260,7 +260,7 @@ def kink_facts(problem: Problem) -> list[Fact]:
 def _start_facts(start: Start | None) -> Iterator[Fact]:
     """The initial V of training, and the error of the rollout's steps."""
     if start is None:
-        yield Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")
+        yield Fact("start", "the network with random weights", "network.name=expansion tries what is known of V")
         return
     if start.steps_miss:
         yield Fact("steps", start.steps_miss, STEP_ERROR_REMEDY)

@@ -19,7 +19,7 @@ LAWS = {  # laws that can follow T, in order of preference
 }
 LOOPS, MULTIPLE = 64, 5  # number of test loops, and their duration in multiples of T
 NEAR = 0.01  # share of the largest distance at t = 0 that always counts as near the goal
-HELD = f"no farther from the goal at {MULTIPLE} T than at T"  # see is_held
+HELD = f"no farther from the goal at {MULTIPLE} T than at T"  # condition of is_held, in words
 LONGEST = 20_000  # largest number of steps of a test loop
 REMEDY = "to choose another, load with beyond=hold, receding, riccati or error"
 
@@ -28,7 +28,7 @@ class AfterHorizon(NamedTuple):
     """A law after T, and how many test loops it keeps near the goal; loops are those without noise."""
 
     beyond: str  # a key of LAWS
-    held: int  # number of test loops that it holds up to MULTIPLE T
+    held: int  # number of test loops that it keeps near the goal up to MULTIPLE T
     loops: int  # number of test loops; 0 if none was tried
     reason: str = ""  # why no law holds all of them; empty if this one does
 

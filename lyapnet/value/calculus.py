@@ -23,7 +23,7 @@ class ValueFunction(nn.Module, ABC):
     """
 
     made_for: type[nn.Module] | None = None
-    """The control law that V is made for, a ValuePolicy; training sets it. None: unknown."""
+    """The control law for which V was trained, a ValuePolicy; training sets it. None: unknown."""
 
     @abstractmethod
     def forward(self, t: Time, x: State) -> PerState:
@@ -38,7 +38,7 @@ class ValueFunction(nn.Module, ABC):
         return None
 
     def curvature_at(self, t: Time, x: State) -> Tensor | None:
-        """The same at a state, on which it depends in a family with weights of the cost."""
+        """The same at a state; it depends on the state in a family with weights of the cost."""
         return self.curvature(t)
 
 
@@ -70,7 +70,7 @@ def time_derivative(V: ValueFunction, system: ControlSystem, t: Time, x: State, 
 
 
 def noise_derivative(V: ValueFunction, sigma: Noise, t: Time, x: State) -> PerState:
-    """½ tr(σσᵀV_xx) = ½ Σ_j σ_jᵀ V_xx σ_j, what the noise σ(x) dW adds to the mean rate of V, by Itô's formula.
+    """½ tr(σσᵀV_xx) = ½ Σ_j σ_jᵀ V_xx σ_j, the part of the noise σ(x) dW in the mean rate of V, by Itô's formula.
 
     Only the second derivatives along the columns of σ are computed: σ_jᵀV_xx is the gradient of V_xᵀσ_j for fixed σ_j.
     """

@@ -10,7 +10,7 @@ from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 
 Step = Callable[[State, Control], tuple[State, PerState]]  # (x, u) ↦ (F, l)
-STEP_ASIDE = 1e-3  # distance from a node at which a missing derivative is taken, relative to the trajectories' extent
+STEP_ASIDE = 1e-3  # distance from a node at which a missing derivative is evaluated, relative to the extent of paths
 
 
 class StepDerivatives:
@@ -73,7 +73,7 @@ class Steps(NamedTuple):
     l_zz: Tensor  # second derivatives of Q besides F_zᵀHF_z
     end: tuple[PerState, State, Tensor]  # φ, φ_x and φ_xx
     replaced: Tensor  # (N + 1, *batch), whether a derivative does not exist at a node
-    beside: Tensor  # (n + m,), the distance from z at which it is then taken
+    beside: Tensor  # (n + m,), the distance from z at which it is then evaluated
 
 
 def steps_along(

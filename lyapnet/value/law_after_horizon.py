@@ -53,14 +53,14 @@ class LawAfterHorizon(nn.Module):
 
     @property
     def beyond(self) -> str:
-        """The name of the law; it is chosen now if nobody did before."""
+        """The name of the law; it is chosen on first use."""
         if self._beyond is None:
             self._follow(self._choose().beyond)
         assert self._beyond is not None
         return self._beyond
 
     def state_within(self, x: State, late: Tensor) -> State:
-        """The state at which V and its law are evaluated, where the horizon begins anew at each step."""
+        """The state at which V and its law are evaluated if the horizon restarts at each step."""
         again = self.problem.system.recurring(x) if self.beyond == "receding" else x
         return x if again is x else torch.where(late[..., None], again, x)
 
@@ -77,7 +77,7 @@ class LawAfterHorizon(nn.Module):
 
 
 class ContinuedValue(ValueFunction):
-    """V(t, x) up to T; after it the value that belongs to the law after T."""
+    """V(t, x) up to T, then the value of the law after T."""
 
     V: ValueFunction
     sequel: LawAfterHorizon
@@ -127,7 +127,7 @@ class ContinuedPolicy(ValuePolicy):
 
     @property
     def beyond(self) -> str:
-        """The name of the law after T; it is chosen now if nobody did before."""
+        """The name of the law after T; it is chosen on first use."""
         return self.sequel.beyond
 
     def forward(self, t: Time, x: State) -> Control:

@@ -10,7 +10,7 @@ from torch import Tensor
 from lyapnet.base.contracts import TO_WRITE
 from lyapnet.base.errors import one_line
 from lyapnet.base.types import InputMatrix, Matrix, PerState, State
-from lyapnet.task.cost import Cost, MadeOfAnother, SmoothedCost, goal_in_words
+from lyapnet.task.cost import Cost, CostWrapper, SmoothedCost, goal_in_words
 from lyapnet.task.domain import as_written
 from lyapnet.task.problem import Problem
 from lyapnet.value.derivatives import jacobian
@@ -19,8 +19,9 @@ from lyapnet.value.expansions import Expansion, in_float64, riccati
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 NAME_A_GOAL = "name target: in the config, or cost.goal, where the task has a goal"
 NEARBY_STATES, NEARBY_DISTANCE = 8, 1e-3  # random states near the goal; their distance, in units of X₀
-TRAINED, SOLVED = 3e-3, 1e-4  # ε of smoothing relative to the usual size: large enough to learn V; small, for optima
-SCALE_STATES = 256  # random states around the goal, as far away as X₀, that give the usual size of a cost
+# ε of smoothing, relative to the usual size: large enough to learn V in training, small for optima
+TRAINED, SOLVED = 3e-3, 1e-4
+SCALE_STATES = 256  # random states around the goal, at the distance of X₀, that give the usual size of a cost
 KINK_DISTANCE = 1e-9  # distance from the goal at which slopes are compared to find a kink, in units of X₀
 KINK_JUMP = 1e-2  # relative jump of the slope that counts as a kink
 
@@ -100,7 +101,7 @@ def smooth_kinks(problem: Problem, share: float = TRAINED) -> Problem:
 
 def _replace_innermost(cost: Cost, written: Cost) -> Cost:
     """Replace the innermost cost; the penalties of constraints and of a domain around it stay."""
-    if cost is as_written(cost) or not isinstance(cost, MadeOfAnother):
+    if cost is as_written(cost) or not isinstance(cost, CostWrapper):
         return written
     outer = copy.deepcopy(cost)
     outer.cost = _replace_innermost(cost.cost, written)
@@ -109,7 +110,7 @@ def _replace_innermost(cost: Cost, written: Cost) -> Cost:
 
 def smoothed_part(cost: Cost) -> SmoothedCost | None:
     """The part of a cost that smooths its kinks; None if there is none."""
-    while isinstance(cost, MadeOfAnother) and not isinstance(cost, SmoothedCost):
+    while isinstance(cost, CostWrapper) and not isinstance(cost, SmoothedCost):
         cost = cost.cost
     return cost if isinstance(cost, SmoothedCost) else None
 
@@ -134,7 +135,7 @@ def singular(error: RuntimeError) -> Missing:
     """A message to the user for an error of torch's linear algebra."""
     return Missing(
         f"a matrix of second derivatives is singular, or not finite ({one_line(error)})",
-        "give every control a weight in R, and look at f, g and the cost where trajectories lead",
+        "give every control a weight in R, and check f, g and the cost at states of trajectories",
     )
 
 

@@ -20,7 +20,7 @@ from lyapnet.value.expansions import held_control, minimise_over_controls, ricca
 from lyapnet.value.risk import equivalent_derivatives
 
 DESCENTS = 3  # Newton steps of the lookahead law
-STEEP = 5  # the same with constraints, near which V is steep
+DESCENTS_WITH_CONSTRAINTS = 5  # the same with constraints, near which V is steep
 SHARES = (1.0, 0.5, 0.25, 0.1)  # step sizes of the line search in each Newton step
 
 
@@ -43,7 +43,7 @@ class LeastCost(NamedTuple):
 class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
-    held: bool = False  # whether u is made to be held for Δt from t on
+    held: bool = False  # whether the law is for controls that are held for Δt from t on
     origin: str = ""  # where V and u come from, if they were imported
     precision: str | None = None  # floating-point format of u for proofs that include its rounding; None: real numbers
     system: ControlSystem
@@ -60,7 +60,7 @@ class ValuePolicy(nn.Module):
         return PolicyOutput(self(t, x), *self.V.value_and_state_gradient(t, x))
 
     def least(self, t: Time, x: State) -> LeastCost | None:
-        """What u costs, as bounds know it; None where they read u(t, x) and ℓ(x, u) as they are written."""
+        """u and its cost as a minimum, for bounds; None if these need no special rule for u(t, x) and ℓ(x, u)."""
         return None
 
 
@@ -173,7 +173,7 @@ class SampledPolicy(ValuePolicy):
     for a V with curvature H, and B = F_u/Δt. F and ∫ℓ are one step of the horizon's method. With Euler steps
     F = x + Δt(f + gu), B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x
     it is the optimal law of a linear problem, and finite at any Δt, whereas −½R⁻¹gᵀV_x is unstable under Euler steps if
-    Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. Both agree as Δt → 0. H is V's own model of its curvature, or the Riccati
+    Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. Both agree as Δt → 0. H is the curvature known to V, or the Riccati
     solution at the goal, or zero without a goal. With a target, u − u* replaces u, and f + gu* replaces f. In a task
     with risk V is replaced by its certainty equivalent over the step, with curvature H (see lyapnet.value.risk).
     """
@@ -218,9 +218,10 @@ class LookaheadPolicy(SampledPolicy):
 
         u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
-    It starts from the sampled law and takes DESCENTS Newton steps (STEEP with constraints) with Q_uu/Δt = ℓ_uu +
-    Δt BᵀV_xxB, or with H for V_xx if that is not convex. Each step uses the step size of SHARES that lowers Q most, or
-    none. It is meant for a V that is steep within one step, as near constraints, where the sampled law overshoots.
+    It starts from the sampled law and takes DESCENTS Newton steps (DESCENTS_WITH_CONSTRAINTS with constraints) with
+    Q_uu/Δt = ℓ_uu + Δt BᵀV_xxB, or with H for V_xx if that is not convex. Each step uses the step size of SHARES that
+    lowers Q most, or none. It is meant for a V that is steep within one step, as near constraints, where the sampled
+    law overshoots.
 
     Its derivative is that of the minimiser (implicit function theorem), up to the remaining Q_u and to V_xᵀF_uu, which
     is zero with Euler steps. Where Q_uu/Δt does not exceed CONVEX · ℓ_uu, step and derivative are those of the model H,
@@ -239,7 +240,7 @@ class LookaheadPolicy(SampledPolicy):
         H = self._curvature(step.after, x)
         with torch.no_grad():
             u = super().forward(t, x)
-            for _ in range(DESCENTS if self.problem.constraints is None else STEEP):
+            for _ in range(DESCENTS if self.problem.constraints is None else DESCENTS_WITH_CONSTRAINTS):
                 u = step.descend(u, H)
         if not torch.is_grad_enabled():
             return u

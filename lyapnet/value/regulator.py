@@ -20,11 +20,11 @@ from lyapnet.value.expansions import in_float64
 DECAY_MARGIN = 1e-9  # smallest relative decay of each mode in a step
 EQUILIBRIUM_TOLERANCE = 1e-6  # largest |ẋ| at the goal under the control at rest
 NODES = 5  # Chebyshev nodes along each parameter of a family
-MOST_NODES = 200  # largest number of nodes of all parameters together
+MOST_NODES = 200  # largest number of nodes for all parameters together
 INTERPOLATION_TOLERANCE = 1e-2  # largest error of an interpolated gain, relative to its largest entry
 ROOT_TOLERANCE = 1e-4  # largest error of an interpolated cost δᵀP(p)δ, relative to it in any direction δ
-ROOT_NODES = 400  # largest number of members through which it is interpolated
-TESTED_MEMBERS = 32  # random members at which it is checked, besides those at the ends of the ranges
+ROOT_NODES = 400  # largest number of members for the interpolation of the root
+TESTED_MEMBERS = 32  # random members at which the interpolant is checked, besides those at the ends of the ranges
 FLAT = 1e-9  # eigenvalues that are added to P(p), relative to the largest, so that its root is unique
 
 
@@ -43,7 +43,7 @@ class Regulator(nn.Module):
     polynomials in its parameters that interpolate the members at Chebyshev nodes.
 
     Args:
-        purpose, instead: what needs the regulator, and the alternative, for messages.
+        purpose, instead: the user of the regulator, and the alternative, for messages.
         spread: whether to add an Nth of φ's Hessian to q in each step if q does not detect every mode that has to be
             stabilised; for tasks that weigh only their terminal state.
 
@@ -76,7 +76,7 @@ class Regulator(nn.Module):
         else:
             products = self.basis(self._parameters_of(x))
             feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(products, self.K, strict=True)])
-        # K is about the control at the goal, which may be another than u* at x
+        # the law is relative to the control at the goal, which may differ from u* at x
         return self.problem.controls.project(self.problem.rest_at(x - offset) - feedback)
 
     def cost(self, x: State) -> PerState:
@@ -118,7 +118,7 @@ class _Solver:
             except (ValueError, np.linalg.LinAlgError) as error:
                 reason = error
         raise ValueError(
-            f"Expected a goal that a linear law stabilises, and a cost q that sees every mode which does not "
+            f"Expected a goal that a linear law stabilises, and a cost q that depends on every mode which does not "
             f"decay, for {self.purpose}, got others ({reason}); give Q more weights, or {self.instead}."
         ) from reason
 
@@ -133,7 +133,7 @@ def _stabilising_gains(
     """
     relevant = moves & ((np.eye(len(A)) != A)[moves].any(0) | Q.any(0) | S.any(1))
     if not relevant.any():
-        raise ValueError("no state has a part in it")
+        raise ValueError("no state is involved")
     A, B, Q, S = A[relevant][:, relevant], B[relevant], Q[relevant][:, relevant], S[relevant]
     from scipy.linalg import solve_discrete_are  # imported here because it takes 0.1 s
 
@@ -184,9 +184,9 @@ def _fit(basis: ChebyshevProducts, exact: Problem, solve: _Solver) -> Gains:
 def root_of_members(problem: Problem, purpose: str, instead: str) -> Interpolant:
     """p ↦ L(p) (n, n), lower triangular, with δᵀP(p)δ = ‖L(p)ᵀδ‖² the cost to go of each member's regulator.
 
-    n is the number of states that are no parameters. L interpolates the Cholesky factors of members by polynomials of
-    the least degree that leaves an error of ROOT_TOLERANCE, in all directions δ: (1 − ε)P ≤ LLᵀ ≤ (1 + ε)P at members
-    between. LLᵀ is nowhere indefinite. Rows of zeros are of states that cost nothing.
+    n is the number of states without the parameters. L interpolates the Cholesky factors of members by polynomials of
+    the least degree with an error ε of at most ROOT_TOLERANCE: (1 − ε)P ≤ LLᵀ ≤ (1 + ε)P at members between the nodes.
+    LLᵀ is positive semidefinite everywhere. States that cost nothing have rows of zeros.
 
     Raises:
         ValueError: a member has no regulator, or no such polynomials fit.

@@ -1,7 +1,7 @@
 """The certainty equivalent of V under noise, for a cost with risk: (1/θ) log E exp(θ V(x + σΔW)).
 
-It is the certain number that is worth as much as the random V: for a small θ the mean plus θ/2 times the variance, for
-a large one almost the largest value. Of a quadratic function, c + pᵀδ + ½ δᵀHδ with S = I − θΔt σᵀHσ positive definite,
+It is the certain number that is equivalent to the random V: for small θ the mean plus θ/2 times the variance, for large
+θ almost the largest value. For a quadratic function, c + pᵀδ + ½ δᵀHδ with S = I − θΔt σᵀHσ positive definite,
 it is again quadratic:
 
     c̃ = c + ½ pᵀGp − log det S / (2θ),   p̃ = p + HGp,   H̃ = H + HGH,   with G = θΔt σS⁻¹σᵀ.

@@ -113,7 +113,7 @@ CHARGE = Own(1, lambda x: -TABLE(x)[..., None] * x, [[1]])
 
 # a system and changes to the task ↦ facts, each with words of what is found, or None where it must not be there
 TASKS = {
-    "logarithm": (LOG, {"lower": 1, "upper": 2}, {"goal": "where f is defined) lies the origin, which stands in"}),
+    "logarithm": (LOG, {"lower": 1, "upper": 2}, {"goal": "where f is defined) lies the origin, the default, because"}),
     "root": (
         ROOT,
         {},

@@ -169,7 +169,8 @@ def test_a_member_outside_the_family_is_noted_once(caplog):
     of_family.value(0.0, [[0.1, 0.0], [0.2, 0.0]], mass=[1.0, 2.1])
     of_family.policy(0.0, [0.1, 0.0], mass=0.4)
     assert [record.getMessage() for record in caplog.records] == [
-        "note: V was told mass in [0.5, 2.0], and is asked outside of that; what it says there is extrapolated."
+        "note: V was trained for mass in [0.5, 2.0] and is evaluated outside of this range; "
+        "values there are extrapolated."
     ]
 
 

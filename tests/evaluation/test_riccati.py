@@ -302,5 +302,5 @@ def test_a_linear_system_with_another_drift_is_not_linear():
 @pytest.mark.parametrize("A", [[[1e300, 1.0], [1.0, 0.0]], [[1e12, 0.0], [0.0, 1.0]], [[0.0, 1e308], [1e308, 0.0]]])
 def test_matrices_that_leave_no_solution_are_one_line(A):
     linear = problem_of(Linear(A, [[0.0], [1.0]]), steps=2, dt=0.1)
-    with pytest.raises(OracleError, match="Expected matrices whose Riccati equation rounding lets be solved"):
+    with pytest.raises(OracleError, match="Expected a Riccati equation that can be solved despite rounding"):
         oracle_of(linear, "rk4")

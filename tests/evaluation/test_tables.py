@@ -27,5 +27,5 @@ def test_rows_on_bounds_are_those_of_programs_that_ask_for_one(program, shown, c
 def test_a_caption_is_made_of_sentences(controller):
     result = lyapnet.evaluate(controller, samples=4, optimum=False)
     caption = str(evaluation_table("x", result).caption)
-    assert caption.startswith("The optimum was not asked for.")
+    assert caption.startswith("The optimum was not requested.")
     assert "The optimum was" not in str(evaluation_table("x", lyapnet.evaluate(controller, samples=4)).caption)

@@ -18,7 +18,7 @@ from lyapnet.task.cost.control_costs import (
     PowerCost,
     PseudoHuberControlCost,
 )
-from lyapnet.task.cost.minimum import least_over, make_known, traced_minimum
+from lyapnet.task.cost.minimum import least_over, register_minimum, traced_minimum
 from lyapnet.task.sets import ControlBox, Unbounded
 from tests.marks import at_the_gate, sample
 
@@ -218,11 +218,11 @@ def test_a_sum_of_costs_of_a_users_own_has_no_description():
         def forward(self, u):
             return 2 * super().forward(u)
 
-    assert make_known(ControlCosts([AbsoluteCost(0.5)]), Unbounded()) is not None
-    assert make_known(Twice([AbsoluteCost(0.5)]), Unbounded()) is None
+    assert register_minimum(ControlCosts([AbsoluteCost(0.5)]), Unbounded()) is not None
+    assert register_minimum(Twice([AbsoluteCost(0.5)]), Unbounded()) is None
 
 
 def test_a_description_has_all_numbers():
     costs = [ControlCosts([PowerCost(0.5, p)]) for p in (1.5, 1.5000000001)] + [ControlCosts([LogCosCost(0.5, 2.2)])]
     sets = [ControlBall(1.0), ControlBall(1 + 1e-15), ControlBox(-1.0, 1.0), Unbounded()]
-    assert len({make_known(cost, U) for cost in costs for U in sets}) == len(costs) * len(sets)
+    assert len({register_minimum(cost, U) for cost in costs for U in sets}) == len(costs) * len(sets)

@@ -17,7 +17,7 @@ from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.branches import decisions
 from lyapnet.prover.rounding import ROUNDED
 from lyapnet.task.cost.control_costs import AbsoluteCost, ControlCosts
-from lyapnet.task.cost.minimum import LEAST, make_known
+from lyapnet.task.cost.minimum import LEAST, register_minimum
 from lyapnet.task.sets import ControlBox
 from tests.marks import sample
 
@@ -28,7 +28,7 @@ INDEX, TWICE = torch.tensor([2, 0]), torch.tensor([2, 2])
 
 with default_dtype(torch.float64):  # in float32 the limits are 4e-9 off
     COST, LIMITS = ControlCosts([AbsoluteCost(0.3)]), ControlBox(-0.4, 0.2)
-    FUEL = make_known(COST, LIMITS)
+    FUEL = register_minimum(COST, LIMITS)
 
 
 def least_fuel(b):

@@ -166,7 +166,7 @@ def test_what_no_control_follows_needs_a_control_to_count_from(caplog):
 
 def test_a_reference_beyond_the_limits_is_told(caplog):
     problem(controls={"lower": -5, "upper": 5})
-    assert "beyond the limits of" in caplog.text
+    assert "more than the limits of" in caplog.text
 
 
 def points(**changes):

@@ -149,4 +149,4 @@ def test_what_cannot_be_traced_says_so_once(tmp_path, monkeypatch, capsys, caplo
     monkeypatch.setitem(NETWORKS, "fcn", Branching)
     assert train(tmp_path, capsys, "network.name=fcn", "rollout.compile=on") == (False, [])
     (record,) = (record for record in caplog.records if record.name.startswith("lyapnet"))
-    assert "runs as it is written" in record.getMessage()
+    assert "runs without being traced" in record.getMessage()

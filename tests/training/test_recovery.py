@@ -119,7 +119,7 @@ def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
 
 def test_before_the_first_step_no_rate_is_to_blame(config, capsys, monkeypatch):
     Breaks(monkeypatch, range(1, 100))
-    with pytest.raises(DivergenceError, match=r"got nan.*no learning rate mends it\. Look at f") as error:
+    with pytest.raises(DivergenceError, match=r"got nan.*the learning rate is not the cause\. Check f") as error:
         run_of(config, capsys)
     assert "Going back" not in capsys.readouterr().out
     assert "lower training.learning_rate" not in str(error.value)

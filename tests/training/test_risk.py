@@ -83,7 +83,7 @@ def test_of_random_plants_the_dear_ones_count_more_and_the_model_as_before():
     [
         ({"risk": 1.0}, "Expected noise or randomise with risk, got neither"),
         ({"risk": -1.0, **NOISE}, "risk"),
-        ({"risk": 1.0, **NOISE, "rollout": {"gradient": "discrete", "policy": "lookahead"}}, "it knows no risk"),
+        ({"risk": 1.0, **NOISE, "rollout": {"gradient": "discrete", "policy": "lookahead"}}, "it ignores risk"),
         (
             {
                 "risk": 1.0,

@@ -96,7 +96,7 @@ def test_the_constructor_says_so_where_nobody_knows_and_it_matters(caplog):
     problem, V = exact()
     lyapnet.Controller(problem, V)
     (note,) = caplog.messages
-    assert "nobody says which control law Quadratic is made for" in note
+    assert "the control law for which Quadratic was trained is unknown" in note
     assert "policy=lyapnet.SampledPolicy" in note
     x0 = problem.initial_states.sample(16)
     optimal = V(torch.tensor(0.0), x0)

@@ -157,7 +157,7 @@ def test_what_is_wrong_with_an_own_cost_is_said_in_words():
 
 def test_where_nothing_moves_and_nothing_costs_there_is_no_regulator():
     idle = {"system": {"name": "linear", "parameters": {"A": [[0.0]], "B": [[1.0]]}}, "cost": {"Q": 0, "R": 1}}
-    with pytest.raises(UsageError, match="no state has a part in it"):
+    with pytest.raises(UsageError, match="no state is involved"):
         problem(CHAIN | idle | {"initial_states": {"lower": [-1], "upper": [1]}})
 
 

@@ -17,7 +17,7 @@ from lyapnet.base.errors import UsageError, raised
 
 REMEDIES = {  # text in an error of torch ↦ what to do
     "before Module.__init__() call": "call super().__init__() first in __init__",
-    "' already exists": "give that attribute of your class another name, which no buffer of it has",
+    "' already exists": "give that attribute of your class another name than that of a buffer",
     "has no setter": "n, m, title and the like are reserved names of every system: give that attribute another one",
     "object is not callable": "an attribute may hide a function of that name: give it another one",
     "Boolean value of Tensor": "write torch.where(x > 0, a, b) in the place of an if",
@@ -59,7 +59,7 @@ def check_function(
         any_size: whether a user's function is also checked for batches of every size, by a trace.
 
     Raises:
-        UsageError: a condition is broken; says which one, and where.
+        UsageError: a condition is broken; names it, and where.
     """
     given = [argument.detach().clone().requires_grad_() for argument in arguments]
     value, batch = check_result(name, function, given, shape), len(given[0])
@@ -88,7 +88,7 @@ def check_result(
     shape: Sequence[int],
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """Call a user's function, and return its result if that has one entry of a given shape for each state.
+    """Call a user's function, check its result, one entry of a given shape for each state, and return it.
 
     Args:
         name: name of the function in messages, such as "Pendulum.f(x)".
@@ -133,7 +133,7 @@ def initialised(part: Any) -> Any:
     """Check that the __init__ of a part of a problem has called super().__init__(), and return the part.
 
     Raises:
-        UsageError: it has not.
+        UsageError: it did not.
     """
     if isinstance(part, nn.Module) and "_modules" not in vars(part):
         raise UsageError(

@@ -18,7 +18,7 @@ SAME_VALUE_TOLERANCE = 1e-6  # states at several jumps that differ by less are e
 ZERO_TOLERANCE = 1e-12  # state that counts as 0, relative to the extent
 CROSSINGS = 4  # lines on which a jump is located to find the states that are constant there
 SLOPE = (
-    "write a slope in its place, such as torch.tanh(v / ε) for torch.sign(v), with ε as wide as what v does in a step"
+    "replace it by a slope, such as torch.tanh(v / ε) for torch.sign(v), with ε as large as the change of v in a step"
 )
 
 DISCRETE_OPERATORS = (
@@ -44,7 +44,7 @@ class Jump(NamedTuple):
     component: int  # index of the component that jumps, in the flattened result
     size: float  # size of its jump
 
-    def told(self, name: str, state_names: Sequence[str]) -> str:
+    def described(self, name: str, state_names: Sequence[str]) -> str:
         """Describe the jump: "Block.f(x) jumps by 11.8 where speed = 0, at system.py:17 (…)"."""
         where = ", ".join(f"{state_names[i]} = {float(self.x[i]):.4g}" for i in self.constant)
         at = f"where {where}" if where else f"as at x = ({', '.join(f'{value:.4g}' for value in self.x.tolist())})"

@@ -151,7 +151,7 @@ class _Tube:
     def step(self, h: float) -> float:
         """Take a step of at most h seconds, and keep the cells for which it is proved; return the next h.
 
-        The step is halved until, for 90 % of the cells, F is no more nonlinear in τ than in ε and z together.
+        The step is halved until, for 90 % of the cells, the nonlinearity of F in τ is at most that in ε and z together.
         """
         enclosure, front = self.enclosure, self.front
         kink = next(t for t in enclosure.kinks if t > front.t + 1e-7 * enclosure.duration)
@@ -235,7 +235,7 @@ class _Tube:
         return ((plus - minus) / (2 * step.diagonal()[:, None, None, None])).movedim(0, -1)
 
     def _radius_at_start(self, front: Front, p: Terms, frame: Moving) -> tuple[Tensor, Tensor]:
-        """(r in the coordinates of the step, the error of ∫ℓ) at its beginning; both include the rounding of p."""
+        """(r, the error of ∫ℓ) at the beginning of a step, in its coordinates; both include the rounding of p."""
         begins = at_step_end(p, self.e, -1)
         size = at_step_end(p.abs(), self.e, 1) + front.end.abs()
         jump = ((begins - front.end).abs() + 16 * EPSILON * size).sum(0) * ROOM

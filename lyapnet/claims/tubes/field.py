@@ -14,7 +14,7 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import random_points
 from lyapnet.task.constraints import Constraints
-from lyapnet.task.problem import TRIED
+from lyapnet.task.problem import TEST_STATES
 
 DEGREE = 3  # of the Taylor forms
 
@@ -70,7 +70,7 @@ class Field:
 
 def _check(field: Field, lower: Corner, upper: Corner) -> None:
     """Refuse a closed loop whose values on batches and at single points differ, or that differs from its parts."""
-    points = random_points(lower, upper, TRIED, torch.Generator().manual_seed(0))
+    points = random_points(lower, upper, TEST_STATES, torch.Generator().manual_seed(0))
     t, x = points[:, 0], points[:, 1:]
     check_function("(f + g u, ℓ)", field.slope, [t, x], (field.n + 1,), differentiable=False, any_size=False)
     with torch.no_grad():

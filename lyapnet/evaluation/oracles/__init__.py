@@ -54,7 +54,7 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
     """
     if problem.controls.limits is None:
         raise OracleError(
-            f"Expected controls without limits, or a set that tells its `limits`, for an optimum, got "
+            f"Expected controls without limits, or a set with known `limits`, for an optimum, got "
             f"{type(problem.controls).__name__}; costs stand alone."
         )
     system, cost, horizon = problem.system, problem.cost, problem.horizon
@@ -68,7 +68,7 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
             return RiccatiOracle(solve(system, cost, horizon))
         except (RuntimeError, OverflowError) as error:  # RuntimeError: torch's LinAlgError is not public
             raise OracleError(
-                f"Expected matrices whose Riccati equation rounding lets be solved, got others ({one_line(error)}); "
+                f"Expected a Riccati equation that can be solved despite rounding, got another ({one_line(error)}); "
                 "choose units in which they are of similar size."
             ) from error
     if importlib.util.find_spec("casadi") is None:

@@ -16,7 +16,7 @@ from lyapnet.task.problem import Problem
 
 
 class TermsOfControls(NamedTuple):
-    """What the controls of a plan add to a nonlinear program."""
+    """The terms of a nonlinear program for the controls of a plan."""
 
     cost: casadi.MX  # per second
     variables: casadi.MX  # ≥ 0
@@ -61,7 +61,7 @@ class CasadiTask:
         return (self.problem.constraints(x),)
 
     def excess_in_torch(self, u: Control) -> tuple[Tensor]:
-        """(what is ≤ 0 in U beside its limits,)."""
+        """(the functions that are ≤ 0 in U, besides its limits,)."""
         excess = self.problem.controls.excess(u)
         assert excess is not None
         return (excess,)
@@ -74,7 +74,7 @@ class CasadiTask:
     def terms_of_controls(self, u: casadi.MX, scale: casadi.MX) -> "TermsOfControls":
         """The cost per second Σ s(u_n) and the inequalities for controls (m, N), whose size is `scale` (m,).
 
-        |uᵢ| and ‖u‖ are variables of their own, at least as large as these, where slopes jump or bend without end at 0.
+        If their slopes jump or have no bound at 0, |uᵢ| and ‖u‖ are additional variables with values at least as large.
         """
         steps = u.shape[1]
         cost, variables, inequalities = casadi.MX(0), list[casadi.MX](), list[casadi.MX]()

@@ -11,7 +11,7 @@ import numpy as np
 from lyapnet.base.threads import seconds_of_work
 from lyapnet.evaluation.oracles.base import Report
 
-HOPELESS = 8  # if the first states fail in such a number, the others are not tried
+HOPELESS = 8  # if this number of first states fail, the others are not tried
 SECONDS = 15.0  # seconds for one state, after which no further initial guess is tried
 EXPLORED = 16  # first states on which all initial guesses are tried, to detect several local minima
 EXPLORED_AGAIN = 8  # the same, if an earlier batch over the same X₀ had a single minimum from each state

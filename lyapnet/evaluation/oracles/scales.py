@@ -9,7 +9,7 @@ from lyapnet.base.types import State
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import Path, at_rest, cheapest, greedy_law, path_under, riccati, sizes
 
-TRIED = 16  # random states of X₀ for trial paths
+TEST_STATES = 16  # number of random states of X₀ for trial paths
 
 
 class Scales:
@@ -28,7 +28,10 @@ class Scales:
         if self._riccati is not None and not all(part.isfinite().all() for part in self._riccati):
             self._riccati = None
         x0 = torch.cat(
-            [problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0)), problem.initial_states.ends(TRIED)]
+            [
+                problem.initial_states.sample(TEST_STATES, torch.Generator().manual_seed(0)),
+                problem.initial_states.ends(TEST_STATES),
+            ]
         )
         paths = self.paths(x0)
         some = paths.cost.isfinite()

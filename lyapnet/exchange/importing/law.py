@@ -16,7 +16,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.experiment.config import Config
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.mapped_controls import MappedControls
-from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.problem import TEST_STATES, Problem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import ValuePolicy
 
@@ -146,7 +146,7 @@ def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
 
 def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
     """Refuse a function that remembers calls, or whose results depend on the size of the batch."""
-    x, ends = states_around(problem)[:TRIED], problem.initial_states.ends(TRIED).double()
+    x, ends = states_around(problem)[:TEST_STATES], problem.initial_states.ends(TEST_STATES).double()
 
     def call(x: State) -> None:
         with torch.no_grad():

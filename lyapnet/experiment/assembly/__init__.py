@@ -2,7 +2,7 @@
 
 from lyapnet.experiment.assembly.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
 from lyapnet.experiment.assembly.entries import entry_per_state
-from lyapnet.experiment.assembly.family import knows, member, ranges_of
+from lyapnet.experiment.assembly.family import is_in_range, member, ranges_of
 from lyapnet.experiment.assembly.learner import build_program, build_rollout, build_value_function
 from lyapnet.experiment.assembly.named_parts import parts_named, parts_of
 from lyapnet.experiment.assembly.plants import build_plants
@@ -21,7 +21,7 @@ __all__ = [
     "build_value_function",
     "default_of",
     "entry_per_state",
-    "knows",
+    "is_in_range",
     "member",
     "named",
     "operating_point",

@@ -81,14 +81,14 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     if cls is None:
         classes = [known for known, value in vars(module).items() if isinstance(value, type)]
         hint = did_you_mean(class_name, classes, "correct the name, or the module.", f"{module_name}:")
-        raise UsageError(f"Expected {key} as a class of {module_name}, got {name!r}, which it has not; {hint}")
+        raise UsageError(f"Expected {key} as a class of {module_name}, got {name!r}, which does not exist; {hint}")
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
     return cls
 
 
 def class_of(options: Any, part: str) -> Any:
-    """The class that a section of a config names; of equations, the class that has these."""
+    """The class that a section of a config names, or the class for its equations."""
     registry, base = REGISTRIES[part]
     cls = resolve(options.name, registry, f"{part}.name", base)
     return class_of_equations(options) if cls is EquationSystem else cls

@@ -59,7 +59,7 @@ def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
     """
     box, draws = problem.initial_states, torch.Generator().manual_seed(0)
     x = box.sample(TEST_STATES, draws)
-    # components that X₀ fixes are varied too, because h may have no slope there
+    # components that X₀ fixes are varied too, because the slope of h may vanish there
     x = x + 0.1 * size_of(box) * (box.lower == box.upper) * torch.randn(x.shape, generator=draws, dtype=x.dtype)
     with torch.enable_grad():
         x.requires_grad_()

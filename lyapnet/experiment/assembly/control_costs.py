@@ -15,7 +15,7 @@ from lyapnet.task.cost.control_costs import CONTROL_COSTS, AbsoluteCost, Control
 from lyapnet.task.sets import ControlBox, ControlSet, Unbounded
 
 KEY = "cost.control_costs"
-OF_OPEN_LIMIT = 1 - 1e-6  # share of it that controls reach: the cost is still finite there
+REACHED_SHARE = 1 - 1e-6  # share of an open limit that controls may reach; the cost is still finite there
 
 
 def control_costs_of(config: CostConfig, m: int) -> ControlCosts | None:
@@ -49,12 +49,12 @@ def _require_contract(key: str, cost: ControlCost, m: int) -> None:
     """Check a cost of a user's own: one number for each u, 0 at u = 0, even, convex, and smooth at 0.
 
     Raises:
-        UsageError: it is not; says which.
+        UsageError: a property is missing; names it.
     """
     name = type(cost).__name__
     if not isinstance(cost, SeparableCost) or isinstance(cost, AbsoluteCost):
         raise UsageError(f"Expected {key} as a smooth SeparableCost of your own, got {name}; derive it from that.")
-    u = ControlCosts([cost]).told_apart(m)
+    u = ControlCosts([cost]).distinguishing_controls(m)
     check_function(f"{name}.forward(u)", cost, [u], ())
     s, zero = cost(u), torch.zeros(1, m, dtype=u.dtype)
     slopes = [cost.slope(share * u).sum(-1) for share in (1e-6, 0.3, 0.6, 1.0)]
@@ -68,10 +68,10 @@ def _require_contract(key: str, cost: ControlCost, m: int) -> None:
 
 
 def within_open_limits(controls: ControlSet, costs: ControlCosts | None, m: int) -> ControlSet:
-    """The controls of a box between the limits at which a cost of theirs is infinite.
+    """The controls of a box at which their costs are finite.
 
     Raises:
-        UsageError: none is left.
+        UsageError: there are none.
     """
     ends: list[Tensor] = [] if costs is None else costs.open_limits
     if not ends or type(controls) not in (Unbounded, ControlBox):
@@ -80,7 +80,7 @@ def within_open_limits(controls: ControlSet, costs: ControlCosts | None, m: int)
         least = ends[0].double().expand(m)
         for end in ends[1:]:
             least = least.minimum(end.double())
-        lower, upper = -OF_OPEN_LIMIT * least, OF_OPEN_LIMIT * least
+        lower, upper = -REACHED_SHARE * least, REACHED_SHARE * least
         if isinstance(controls, ControlBox):
             lower, upper = lower.maximum(controls.lower.double()), upper.minimum(controls.upper.double())
         if not bool((lower < upper).all()):

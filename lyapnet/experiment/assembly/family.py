@@ -15,7 +15,7 @@ from lyapnet.experiment.assembly.classes import Parts, section
 from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
 from lyapnet.experiment.assembly.weights import named, weighted_matrices, weights_among, weights_of, with_weights
 from lyapnet.experiment.config import Config
-from lyapnet.task.cost import Cost, MadeOfAnother, innermost
+from lyapnet.task.cost import Cost, CostWrapper, innermost
 from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
@@ -42,7 +42,7 @@ def family_of(
         UsageError: a name is neither a parameter of the system, nor target_STATE, nor a weight of the cost; a range is
             invalid, a member breaks the contract of FamilySystem, or no control holds the target of a member.
     """
-    if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
+    if isinstance(cost, CostWrapper) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
     weights = weights_among(config.family, system)
     ranges = named(checked_ranges(config.family, "family"), system)
@@ -54,7 +54,7 @@ def family_of(
                 f"Expected no weight of Q_T in a family with horizon.stationary, got {name}; φ is the regulator's: "
                 "remove it."
             )
-    moved = _moved_states(ranges, system)
+    moved = _find_target_parameters(ranges, system)
     units = [""] * len(ranges)
     for i, k in moved.items():
         units[k] = system.state_units[i]
@@ -114,14 +114,14 @@ def member(
             values[name] = float(given[name])
         except (TypeError, ValueError, RuntimeError) as error:
             raise UsageError(f"Expected {name} as one number, got {given[name]!r}; name one member.") from error
-        if not knows(ends, values[name]):
-            raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
+        if not is_in_range(ends, values[name]):
+            raise UsageError(f"Expected {name} in {ends}, for which V was trained, got {values[name]:g}.")
     numbers = {name: values[name] for name in family.parameters_in_f}
     system = dataclasses.replace(config.system, parameters={**config.system.parameters, **numbers})
     weights = {weights_of(family.system)[name]: values[name] for name in family.weights}
     cost = dataclasses.replace(config.cost, **with_weights(config.cost, weights, family.system))
     p = [math.log10(value) if name in family.weights else value for name, value in values.items()]
-    target = target_of_member(config, problem, _moved_states(values, family.system), p)
+    target = target_of_member(config, problem, _find_target_parameters(values, family.system), p)
     own = dataclasses.replace(copy.deepcopy(config), system=system, cost=cost, target=target, family={})
     return own, dataclasses.replace(parts, system=with_attributes(family.system, numbers)), p
 
@@ -131,7 +131,7 @@ def ranges_of(config: Config, family: FamilySystem) -> dict[str, list[float]]:
     return dict(zip(family.names, config.family.values(), strict=True))
 
 
-def knows(ends: Sequence[float], value: float) -> bool:
+def is_in_range(ends: Sequence[float], value: float) -> bool:
     """Whether a value is in the range of a family's parameter, up to rounding."""
     least, greatest = ends
     room = 1e-9 * max(abs(least), abs(greatest))
@@ -142,7 +142,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
     """The ranges [least, greatest] of the parameters of a section, by name.
 
     Raises:
-        UsageError: a name is reserved, or a range is none.
+        UsageError: a name is reserved, or a range is invalid.
     """
     for name, bounds in ranges.items():
         if name in RESERVED_NAMES:
@@ -156,7 +156,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
     return dict(ranges)
 
 
-def _moved_states(names: Collection[str], system: ControlSystem) -> dict[int, int]:
+def _find_target_parameters(names: Collection[str], system: ControlSystem) -> dict[int, int]:
     """Index of a state ↦ index of the parameter target_STATE that is its target."""
     known = {PREFIX + joined(name): i for i, name in enumerate(system.state_names)}
     moved = dict[int, int]()

@@ -15,7 +15,7 @@ MAX_COST_SHARE = 0.01  # largest increase of the cost by the suggested weight
 def refuse_free_controls(problem: Problem, R: Tensor) -> None:
     """Refuse an R that is only positive semidefinite if controls have limits; the error suggests another R.
 
-    The optimum is then bang-bang, and its V has kinks, for which no control law here is made. A weight r on the free
+    The optimum is then bang-bang, and its V has kinks, which no control law here supports. A weight r on the free
     controls adds at most r T Σ max u² to the cost. The suggested r makes this MAX_COST_SHARE of the mean of T |q| + |φ|
     over X₀.
 
@@ -24,7 +24,7 @@ def refuse_free_controls(problem: Problem, R: Tensor) -> None:
         R: (m, m), or one for each of some states (b, m, m).
 
     Raises:
-        UsageError: R is only positive semidefinite; suggests a weight and states its price.
+        UsageError: R is only positive semidefinite; suggests a weight and states what it adds to the cost.
     """
     with torch.no_grad():
         diagonal = R.diagonal(dim1=-2, dim2=-1).reshape(-1, problem.system.m)

@@ -12,7 +12,7 @@ from lyapnet.experiment.assembly.entries import entry_per_state, index_of
 from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import Program
 from lyapnet.loop.rollout import Rollout
-from lyapnet.task.cost import Cost, MadeOfAnother, RegulatorsTail
+from lyapnet.task.cost import Cost, CostWrapper, RegulatorsTail
 from lyapnet.task.family import FamilySystem, family_cost_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlSystem
@@ -100,7 +100,7 @@ def _members(problem: Problem, kept: list[int]) -> Members:
     """
     cost, system = problem.cost, problem.system
     while not isinstance(cost, RegulatorsTail):
-        assert isinstance(cost, MadeOfAnother)
+        assert isinstance(cost, CostWrapper)
         cost = cost.cost
     n = cost.n
     needed = [i for i in range(system.n) if i >= n or bool(cost.root.coefficients[:, i].any())]
@@ -125,9 +125,7 @@ def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str)
             "Expected horizon.stationary: true with the stationary network, got a horizon that ends; its V has no time."
         )
     if stationary and terminal == "exact":
-        raise UsageError(
-            "Expected network.terminal=free with horizon.stationary, got exact; V has no end at which it could be φ."
-        )
+        raise UsageError("Expected network.terminal=free with horizon.stationary, got exact; V has no final time.")
 
 
 def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout:

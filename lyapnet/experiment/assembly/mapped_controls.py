@@ -1,4 +1,4 @@
-"""What a config may have beside a control set that is mapped, as limits that depend on the state."""
+"""Restrictions of configs with a mapped control set, such as limits that depend on the state."""
 
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.config import Config
@@ -8,12 +8,12 @@ from lyapnet.task.sets import ControlSet, Unbounded
 
 
 def set_for_target(controls: ControlSet) -> ControlSet:
-    """The set in which the control at a target is sought: whether a mapped one has it is tested later."""
+    """The set in which the control at a target is sought; for a mapped set the control is tested later."""
     return Unbounded() if isinstance(controls, MappedControls) else controls
 
 
 def refuse_beside_mapped_controls(config: Config, controls: MappedControls) -> None:
-    """Refuse the parts of a task that do not know shares.
+    """Refuse the parts of a task that do not support shares.
 
     Raises:
         UsageError: names the part.

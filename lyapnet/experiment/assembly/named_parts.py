@@ -36,7 +36,7 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
     return Parts(**{part: builders[part]() for part in names})
 
 
-def python_of(config: Config, part: str) -> str:
+def python_expression(config: Config, part: str) -> str:
     """The Python expression that builds a user's part of a config, assuming that its module is imported."""
     options = getattr(config, part)
     name = options.name.replace(":", ".")

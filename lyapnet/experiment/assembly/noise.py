@@ -38,10 +38,11 @@ def build_noise(config: Config, system: ControlSystem) -> Noise | None:
 
 
 def check_risk(config: Config, problem: Problem) -> None:
-    """Check that a task with risk has something random, and what can be done with it.
+    """Check that a task with risk is random, and that its settings support risk.
 
     Raises:
-        UsageError: there is neither noise nor random plants, too many sources of noise, or a law that knows no risk.
+        UsageError: there is neither noise nor random plants, too many sources of noise, or a law that ignores
+        risk.
     """
     if not config.risk:
         return
@@ -54,12 +55,12 @@ def check_risk(config: Config, problem: Problem) -> None:
         )
     if config.rollout.policy not in ("sampled", "hjb"):
         raise UsageError(
-            f"Expected rollout.policy=sampled or hjb with risk, got {config.rollout.policy}; it knows no risk."
+            f"Expected rollout.policy=sampled or hjb with risk, got {config.rollout.policy}; it ignores risk."
         )
 
 
 def _require_support(config: Config) -> None:
-    """Raise UsageError for settings that know no noise."""
+    """Raise UsageError for settings that do not support noise."""
     if config.horizon.stationary:
         raise UsageError(
             "Expected horizon.stationary: false with noise, got true; the cost of noise over an infinite time is "
@@ -67,11 +68,11 @@ def _require_support(config: Config) -> None:
         )
     if config.rollout.gradient != "discrete":
         raise UsageError(
-            f"Expected rollout.gradient=discrete with noise, got {config.rollout.gradient}; the other gradients know "
-            "none: take it."
+            f"Expected rollout.gradient=discrete with noise, got {config.rollout.gradient}; the other gradients do "
+            "not support it."
         )
     if config.network.name in ("icnn", "anchored", "quadratic"):
         raise UsageError(
             f"Expected network.name=expansion or fcn with noise, got {config.network.name}; that V is 0 at the goal, "
-            "where V has to be what the noise costs: take another."
+            "where V has to be the cost of the noise: take another."
         )

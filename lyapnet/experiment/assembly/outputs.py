@@ -13,7 +13,7 @@ from lyapnet.experiment.config import OutputsConfig
 from lyapnet.loop.estimation.kalman import initial_deviation, least_drift
 from lyapnet.task.input_disturbances import with_input_disturbances
 from lyapnet.task.outputs import MeasuredStates, Outputs, SystemOutput
-from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.problem import TEST_STATES, Problem
 from lyapnet.task.systems import moving_states
 
 ASSUMED, DISTURBANCES = "outputs.process_noise", "outputs.input_disturbances"
@@ -47,14 +47,14 @@ def build_outputs(config: OutputsConfig, problem: Problem) -> Outputs | None:
                 f"Expected outputs.measure, or a method output(x) of {name}, got neither; name the states that are "
                 f"measured, of {', '.join(system.state_names)}."
             )
-        x = problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0))
+        x = problem.initial_states.sample(TEST_STATES, torch.Generator().manual_seed(0))
         return SystemOutput(system, config.noise, x)
 
 
 def problem_of_estimator(config: OutputsConfig, problem: Problem) -> Problem:
-    """The problem whose states are estimated: (x, d) where the config names disturbances d of controls.
+    """The problem whose states are estimated: (x, d) if the config names disturbances d of controls.
 
-    At first they have the standard deviation σ√T, which is how far they drift in the horizon.
+    Their initial standard deviation is σ√T, that of their drift over the horizon.
 
     Raises:
         UsageError: a name is no control.
@@ -70,10 +70,10 @@ def problem_of_estimator(config: OutputsConfig, problem: Problem) -> Problem:
 def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
     """The random walk (n,) that an estimator assumes of each of its states besides the noise of the problem.
 
-    Where neither a walk of x is given nor the problem has noise, it is `least_drift`.
+    If neither a walk of x nor noise of the problem is given, it is `least_drift`.
 
     Args:
-        problem: that of the estimator.
+        problem: the problem of the estimator.
 
     Raises:
         UsageError: a name is no state.
@@ -88,7 +88,7 @@ def drift_of(config: OutputsConfig, problem: Problem) -> Tensor:
 
 
 def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
-    """The standard deviation (n,) of the first estimate of each state; of parameters that of their range.
+    """The standard deviation (n,) of the first estimate of each state; for parameters that of their range.
 
     Raises:
         UsageError: the length does not fit.
@@ -103,10 +103,10 @@ def deviation_of(config: OutputsConfig, problem: Problem) -> Tensor:
 
 
 class EstimatorParts(NamedTuple):
-    """What an estimator is made of, in float64."""
+    """The parts of an estimator, in float64."""
 
-    problem: Problem  # whose states are estimated
-    outputs: Outputs  # of these states
+    problem: Problem  # the problem whose states are estimated
+    outputs: Outputs  # the readings of these states
     drift: Tensor  # see drift_of
     deviation: Tensor  # see deviation_of
 
@@ -127,6 +127,6 @@ def estimator_parts(config: OutputsConfig, problem: Problem) -> EstimatorParts |
     if len(config.input_disturbances) > outputs.count:
         raise UsageError(
             f"Expected at most as many {DISTURBANCES} as readings, {outputs.count}, got "
-            f"{len(config.input_disturbances)}; leave some out: readings cannot tell more."
+            f"{len(config.input_disturbances)}; leave some out: the readings do not determine more."
         )
     return parts

@@ -28,13 +28,13 @@ from lyapnet.experiment.assembly.noise import build_noise, check_risk
 from lyapnet.experiment.assembly.outputs import estimator_parts
 from lyapnet.experiment.assembly.reference import reference_of, require_points
 from lyapnet.experiment.assembly.stationary import without_end
-from lyapnet.experiment.assembly.target import Trim, about_target, trim
+from lyapnet.experiment.assembly.target import Trim, trim, with_target
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
 from lyapnet.task.contracts import check_shapes_of_controls, check_shapes_of_cost, check_shapes_of_system
 from lyapnet.task.cost import (
     COSTS,
     Cost,
-    MadeOfAnother,
+    CostWrapper,
     ObstacleCost,
     PeriodicCost,
     PseudoHuberCost,
@@ -44,7 +44,7 @@ from lyapnet.task.cost import (
 )
 from lyapnet.task.horizon import TABLEAUX, Horizon
 from lyapnet.task.mapped_controls import MappedControls
-from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.problem import TEST_STATES, Problem
 from lyapnet.task.sets import Box, ControlBox, ControlSet
 from lyapnet.task.systems import ControlSystem, Linear
 
@@ -75,9 +75,9 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             _refuse_free_controls(config, system, controls, initial_states, horizon)
         with section("cost"):
             cost = build_cost(_cost_section(config), system) if cost is None else cost.double()
-            if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
+            if config.cost.huber is not None and not isinstance(parts.cost, CostWrapper):
                 cost = PseudoHuberCost(cost, config.cost.huber)
-            if not isinstance(parts.cost, MadeOfAnother):
+            if not isinstance(parts.cost, CostWrapper):
                 cost = _with_time(config.cost, cost, system)
         check_shapes_of_cost(copied(cost), system.m, x)
         with section("controls"):
@@ -94,9 +94,9 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             system, cost, initial_states = family_of(
                 config, system, cost, controls, initial_states, own_cost=parts.cost is not None
             )
-        elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
-            cost = about_target(config, cost, system, set_for_target(controls), initial_states)
-        if not isinstance(parts.cost, MadeOfAnother):
+        elif not isinstance(parts.cost, CostWrapper):  # a composite cost from the user is not changed
+            cost = with_target(config, cost, system, set_for_target(controls), initial_states)
+        if not isinstance(parts.cost, CostWrapper):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(
             system,
@@ -113,7 +113,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             _refuse_free_controls_of_own_cost(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
-        estimator_parts(config.outputs, problem)  # raises what is wrong before a training, which knows no outputs
+        estimator_parts(config.outputs, problem)  # raises errors in outputs now, because training does not use them
         problem = in_domain(config.domain, problem)
         if problem.constraints is not None and config.constraints.margin is None and config.network.penalty:
             problem.constraints.margin = choose_margins(problem, problem.constraints)
@@ -143,7 +143,7 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
 
 def _checked_states(system: ControlSystem, initial_states: Box) -> State:
     """States of X₀ at which f, g and ẋ have the right shapes; a UsageError where they do not."""
-    x = initial_states.sample(TRIED, torch.Generator().manual_seed(0))
+    x = initial_states.sample(TEST_STATES, torch.Generator().manual_seed(0))
     check_shapes_of_system(copied(system), x)
     return x
 
@@ -169,7 +169,7 @@ def _refuse_free_controls(
         controls = build_controls(config.controls, system) if controls is None else controls.double()
         if isinstance(controls, MappedControls):
             return
-        cost = about_target(config, weighted, system, controls, initial_states)
+        cost = with_target(config, weighted, system, controls, initial_states)
         problem = Problem(system, cost, controls, initial_states, horizon)
     except (LyapnetError, ValueError, TypeError, RuntimeError):
         return
@@ -213,7 +213,7 @@ def build_cost(config: CostConfig, system: ControlSystem | None = None) -> Cost:
             raise UsageError("Expected cost.periodic with the quadratic cost, got another; write it into your own.")
         return instance_of(config, "cost")
     assert system is not None
-    if config.time is not None:  # time is what states cost, and at the end as much as in a last second near the goal
+    if config.time is not None:  # states cost time; φ is the cost of one second near the goal
         at_end = (config.time * _nearness(config, system)).tolist()
         config = replace(
             config, Q=0.0 if config.Q is None else config.Q, Q_T=at_end if config.Q_T is None else config.Q_T
@@ -243,7 +243,9 @@ def _with_control_costs(config: Config, cost: Cost, controls: ControlSet, m: int
     if costs is None:
         return controls
     if config.horizon.stationary:
-        raise UsageError(f"Expected no {KEY} with horizon.stationary, got some; its regulator knows uᵀRu alone.")
+        raise UsageError(
+            f"Expected no {KEY} with horizon.stationary, got some; its regulator is computed for uᵀRu alone."
+        )
     cost.nonquadratic = costs
     controls = within_open_limits(controls, costs, m)
     with section(KEY):
@@ -278,8 +280,8 @@ def _nearness(config: CostConfig, system: ControlSystem) -> Tensor:
     widths = by_state(config.within, "cost.within", system)
     if not widths or not all(type(width) in (int, float) and 0 < width < math.inf for width in widths.values()):
         raise UsageError(
-            f"Expected cost.within as {{state: distance > 0}} with cost.time, got {config.within}; say how near the "
-            "goal counts as there."
+            f"Expected cost.within as {{state: distance > 0}} with cost.time, got {config.within}; give the "
+            "distance from the goal at which it counts as reached."
         )
     Q = torch.zeros(system.n, system.n)
     for i, width in widths.items():
@@ -308,7 +310,7 @@ def _control_weight(R: Any, system: ControlSystem) -> Any:
     inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
     if inverse_mass is None:
         raise ValueError(
-            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} has not; write R as rows."
+            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} does not have; write R as rows."
         )
     # constant for a linear system: the Riccati equation needs a matrix
     return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass

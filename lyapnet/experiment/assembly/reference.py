@@ -12,22 +12,23 @@ from lyapnet.base.linear_algebra import apply
 from lyapnet.experiment.assembly.entries import repeated, require_length
 from lyapnet.experiment.assembly.target import log_once
 from lyapnet.experiment.config import Config, ReferenceConfig
-from lyapnet.task.cost import Cost, MadeOfAnother, TargetCost, innermost
+from lyapnet.task.cost import Cost, CostWrapper, TargetCost, innermost
 from lyapnet.task.family import FamilyCost, InterpolatedTargets
-from lyapnet.task.problem import TRIED
+from lyapnet.task.problem import TEST_STATES
 from lyapnet.task.reference import TimedSystem
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem, states_that_are_rates
 from lyapnet.value.derivatives import jacobian_of
 
-COUNTS = (9, 17, 33, 65, 129)  # numbers of functions that r is a sum of; the first is taken that is accurate
-ACCURATE = 1e-4  # largest distance of r from the given points, relative to the extent of each state
-CLOSED = 1e-3  # largest distance between the first and the last point of a periodic reference, likewise
-MOST_AWAY = 0.02  # largest distance with the last of COUNTS
-LEAST_STEPS = 8  # fewest steps in which a reference is gone through
-BETWEEN = 4  # times between two points at which rates are compared
-FOLLOWED = 1e-2  # largest rate that u_r leaves, relative to the largest one of that state along r
-ADVICE = "give columns for other states, or say what the cost counts u from, as in reference.control: [0]"
+COUNTS = (9, 17, 33, 65, 129)  # numbers of terms of r; the smallest that reaches MAX_DISTANCE is used
+# Distances are relative to the extent of each state.
+MAX_DISTANCE = 1e-4  # largest distance of r from the given points
+MAX_GAP = 1e-3  # largest distance between the first and the last point of a periodic reference
+MAX_DISTANCE_AT_LAST = 0.02  # largest distance of r from the given points with the last of COUNTS
+LEAST_STEPS = 8  # least number of steps along a reference
+TIMES_BETWEEN = 4  # number of times between two points at which rates are compared
+MAX_RATE_LEFT = 1e-2  # largest rate that u_r leaves, relative to the largest rate of that state along r
+ADVICE = "give columns for other states, or give the control along r, as in reference.control: [0]"
 
 
 def reference_of(
@@ -50,7 +51,7 @@ def reference_of(
             "Expected a reference without target, target_control, family and horizon.stationary, got one of them; "
             "leave it out."
         )
-    if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
+    if isinstance(cost, CostWrapper) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a reference, got one about a goal of its own.")
     times, values = _points_of(config, system)
     path, control, left = _fit(times, values, system, initial_states, reference.periodic)
@@ -61,7 +62,7 @@ def reference_of(
         control.coefficients[0] = control.coefficients.new_tensor(given)  # the first function is 1
     else:
         _require_followed(system, left)
-        _tell_limits(system, controls, control.at(_between(times)))
+        _log_exceeded_limits(system, controls, control.at(_between(times)))
     start = torch.zeros(1, dtype=torch.float64)
     x, u = path.at(start), control.at(start)
     points = torch.cat([path.at(path.basis.nodes()), control.at(path.basis.nodes())], -1)
@@ -74,7 +75,7 @@ def reference_of(
 
 
 def require_points(reference: ReferenceConfig) -> None:
-    """Refuse a reference that says something, but has no points; those of a file are read with the YAML."""
+    """Refuse a reference with settings but without points; points of a file are read with the YAML."""
     if reference.file:
         raise UsageError(
             f"Expected reference.points, got reference.file {reference.file!r}, which is read where a YAML file is "
@@ -124,7 +125,7 @@ def _points_of(config: Config, system: ControlSystem) -> tuple[np.ndarray, dict[
             )
         if len(column) != len(times):
             raise UsageError(f"Expected {len(times)} numbers for {name}, one for each t, got {len(column)}.")
-        if reference.periodic and abs(column[0] - column[-1]) > CLOSED * np.ptp(column):
+        if reference.periodic and abs(column[0] - column[-1]) > MAX_GAP * np.ptp(column):
             raise UsageError(
                 f"Expected a periodic reference to end where it begins, got {name} from {column[0]:g} to "
                 f"{column[-1]:g}; give the first point again at t = the period."
@@ -157,7 +158,7 @@ def _fit(
     States that are not given are rates of others, or 0.
 
     Raises:
-        UsageError: no such function is near enough.
+        UsageError: no such function is within the tolerance.
     """
     from scipy.interpolate import CubicSpline  # imported here because it takes 0.3 s
 
@@ -167,14 +168,14 @@ def _fit(
     rates, duration = _rates_of(system, initial_states, values), float(times[-1])
     zeros, extent = [i for i in range(system.n) if i not in values and i not in rates], np.ptp(columns, 0)
     if zeros:
-        log_once(f"reference: 0 for {', '.join(system.state_names[i] for i in zeros)}, which it does not give.")
+        log_once(f"reference: 0 for {', '.join(system.state_names[i] for i in zeros)}, which are not given.")
     best: tuple[_Curve, _Curve, Tensor] | None = None
     for count in COUNTS:
         ends = torch.zeros(1, dtype=torch.float64), torch.tensor([duration], dtype=torch.float64)
         basis = FourierSeries(duration, count) if periodic else ChebyshevProducts(*ends, [count])
         given = _Curve(basis, basis.coefficients(torch.from_numpy(spline(basis.nodes()[:, 0].numpy()))))
         away = np.abs(given.at(torch.from_numpy(times)[:, None]).numpy() - columns) / np.where(extent > 0, extent, 1.0)
-        if away.max() > (ACCURATE if count < COUNTS[-1] else MOST_AWAY):
+        if away.max() > (MAX_DISTANCE if count < COUNTS[-1] else MAX_DISTANCE_AT_LAST):
             continue
         coefficients = torch.zeros(count, system.n, dtype=torch.float64)
         coefficients[:, [*values]] = given.coefficients
@@ -186,7 +187,7 @@ def _fit(
         left = _rates_left(system, path, control, _between(times))
         if best is None or bool(left.max() < best[2].max() / 2):
             best = path, control, left
-        if bool(left.max() <= FOLLOWED / 10):
+        if bool(left.max() <= MAX_RATE_LEFT / 10):
             break
     if best is None:
         raise UsageError(
@@ -198,7 +199,7 @@ def _fit(
 
 def _rates_of(system: ControlSystem, initial_states: Box, given: Mapping[int, np.ndarray]) -> dict[int, int]:
     """Index of a state that is not given ↦ that of the given one whose rate it is, such as velocity ↦ position."""
-    x = initial_states.sample(TRIED, torch.Generator().manual_seed(0)).double()
+    x = initial_states.sample(TEST_STATES, torch.Generator().manual_seed(0)).double()
     return {i: j for i, j in states_that_are_rates(system, x) if i not in given and j in given}
 
 
@@ -209,8 +210,8 @@ def _following_control(system: ControlSystem, path: _Curve, tau: Tensor) -> Tens
 
 
 def _between(times: np.ndarray) -> Tensor:
-    """Times (k, 1) between the points of the reference, and at them."""
-    return torch.linspace(0, float(times[-1]), BETWEEN * len(times) + 1, dtype=torch.float64)[:, None]
+    """Times (k, 1) at the points of the reference and between them."""
+    return torch.linspace(0, float(times[-1]), TIMES_BETWEEN * len(times) + 1, dtype=torch.float64)[:, None]
 
 
 def _rates_left(system: ControlSystem, path: _Curve, control: _Curve, tau: Tensor) -> Tensor:
@@ -223,16 +224,18 @@ def _rates_left(system: ControlSystem, path: _Curve, control: _Curve, tau: Tenso
 
 def _require_followed(system: ControlSystem, left: Tensor) -> None:
     worst = int(left.argmax())
-    if not float(left[worst]) <= FOLLOWED:
+    if not float(left[worst]) <= MAX_RATE_LEFT:
         raise UsageError(
             f"Expected a reference that some control follows, f(r) + g(r)u = ṙ, got {float(left[worst]):.2g} of the "
             f"rate of {system.state_names[worst]} left by any; {ADVICE}."
         )
 
 
-def _tell_limits(system: ControlSystem, controls: ControlSet, u: Tensor) -> None:
-    """Say in a note which of the controls u (k, m) along the reference are beyond their limits."""
+def _log_exceeded_limits(system: ControlSystem, controls: ControlSet, u: Tensor) -> None:
+    """Log which of the controls u (k, m) along the reference exceed their limits."""
     beyond = (controls.project(u) - u).abs().amax(0) > 0
     if bool(beyond.any()):
         names = ", ".join(name for name, far in zip(system.control_names, beyond.tolist(), strict=True) if far)
-        log_once(f"reference: beyond the limits of {names}; it is followed as well as they allow.")
+        log_once(
+            f"reference: it needs more than the limits of {names} allow; the closed loop follows as well as it can."
+        )

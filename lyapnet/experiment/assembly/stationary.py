@@ -19,19 +19,19 @@ MEMBERS = 64  # random members of a family whose goals are checked, besides thos
 def without_end(problem: Problem) -> Problem:
     """The problem with φ = (x − x*)ᵀP(x − x*), the infinite-horizon cost of the regulator linearised at the goal.
 
-    V of the linearised problem then equals φ at every t, for any T. In a family that is so for each member. The control
-    at the goal has to be inside its limits.
+    V of the linearised problem then equals φ at every t, for any T; in a family for each member. The control at the
+    goal has to be inside its limits.
 
     Raises:
         UsageError: no control inside the limits holds the goal, it violates constraints, staying there has a cost, or
-            no regulator stabilises it; of a family, of any member.
+            no regulator stabilises it; in a family for some member.
     """
     system, limits = problem.system, problem.controls.limits
     if not system.affine:
         raise UsageError(f"Expected a control-affine system for {PURPOSE}, got {system.title}; take stationary: false.")
     if limits is None:
         raise UsageError(
-            f"Expected controls without limits, or a set that tells its `limits`, for {PURPOSE}, got "
+            f"Expected controls without limits, or a set with known `limits`, for {PURPOSE}, got "
             f"{type(problem.controls).__name__}; choose another, or stationary: false."
         )
     parameters = len(system.names) if isinstance(system, FamilySystem) else 0

@@ -19,7 +19,7 @@ from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlSystem
 
 LISTED_POINTS = 4  # largest number of further operating points in a note
-CONTROL_ADVICE = "say what the cost counts u from, as in target_control: [0]"
+CONTROL_ADVICE = "give the control u* about which the cost is zero, as in target_control: [0]"
 
 
 class Trim(NamedTuple):
@@ -30,10 +30,10 @@ class Trim(NamedTuple):
     note: str  # how it was found; empty if the given target is held exactly
 
 
-def about_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet, initial_states: Box) -> Cost:
+def with_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet, initial_states: Box) -> Cost:
     """The cost with the target of a config, if there is one; a note reports components that were solved for."""
     if config.target_control is not None:
-        return about_written_target(config, cost, system, controls)
+        return with_written_target(config, cost, system, controls)
     if config.target is None:
         return cost
     (x, u, *_), _, note = trim(config, system, controls, initial_states)
@@ -41,7 +41,7 @@ def about_target(config: Config, cost: Cost, system: ControlSystem, controls: Co
     return TargetCost(cost, x, u)
 
 
-def about_written_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet) -> Cost:
+def with_written_target(config: Config, cost: Cost, system: ControlSystem, controls: ControlSet) -> Cost:
     """The cost with exactly the given x* and u*."""
     if config.target is None:
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")

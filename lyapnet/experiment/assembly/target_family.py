@@ -11,12 +11,12 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.interpolation import ChebyshevProducts, fewest_products
 from lyapnet.experiment.assembly.target import (
     CONTROL_ADVICE,
-    about_written_target,
     log_once,
     named_entries,
     not_held_error,
     state_limits,
     trim,
+    with_written_target,
 )
 from lyapnet.experiment.config import Config
 from lyapnet.task.cost import Cost, TargetCost
@@ -25,10 +25,10 @@ from lyapnet.task.operating_points import HELD, OperatingPoint, OperatingPoints
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 
-TESTED = 8  # random members whose targets are checked, besides those at the ends of the ranges
-MOST_MEMBERS = 400  # largest number of members whose targets are interpolated
+TEST_MEMBERS = 8  # number of random members whose targets are checked, besides those at the ends of the ranges
+MOST_MEMBERS = 400  # largest number of members for interpolation of targets
 CHOOSE_ANOTHER = f"choose another, or {CONTROL_ADVICE}"
-ACCURATE = 1e-8  # largest rate at an interpolated target, in units of the rates on X₀
+MAX_RATE = 1e-8  # largest rate at an interpolated target, in units of the rates on X₀
 
 
 def cost_and_targets(
@@ -55,8 +55,8 @@ def cost_and_targets(
     if config.target_control is not None:
         if config.target is None:
             members.put_others_at_zero()
-        return about_written_target(members.config_of(ranges.center), cost, family.system, controls), linear
-    tested = torch.cat([ranges.corners(), ranges.sample(TESTED, torch.Generator().manual_seed(0))])
+        return with_written_target(members.config_of(ranges.center), cost, family.system, controls), linear
+    tested = torch.cat([ranges.corners(), ranges.sample(TEST_MEMBERS, torch.Generator().manual_seed(0))])
     middle = members.solve_middle(tested)
     cost = TargetCost(cost, middle.x, middle.u)
     if not members.solved:
@@ -119,7 +119,9 @@ class TargetsOfMembers:
         self.written, self.solved = dict.fromkeys(range(self.family.system.n), 0.0), []
 
     def solve_middle(self, tested: Tensor) -> OperatingPoint:
-        """The operating point of the member in the middle; without any written target others are at 0 if that is held.
+        """The operating point of the member in the middle; without a target in the config, other states are 0.
+
+        They are solved for instead if no control holds that state.
 
         Raises:
             UsageError: none of its controls holds it.
@@ -138,7 +140,7 @@ class TargetsOfMembers:
         return found.point
 
     def point(self, p: Tensor) -> OperatingPoint:
-        """The operating point of a member, in the branch of those of members beside it; see `beside`."""
+        """The operating point of a member, continued from those of neighbouring members; see `beside`."""
         nearest_first = sorted(self._known, key=lambda known: float(((known[0] - p) / self.unit).norm()))
         if nearest_first and torch.equal(nearest_first[0][0], p):
             return nearest_first[0][1]
@@ -147,7 +149,7 @@ class TargetsOfMembers:
         return found
 
     def beside(self, x: Tensor, p: Tensor) -> OperatingPoint:
-        """The operating point of a member that is the nearest to a state, or has all given states.
+        """The operating point of a member that is nearest to a state, or has all given states.
 
         Raises:
             UsageError: no admissible control holds it.
@@ -183,21 +185,21 @@ class TargetsOfMembers:
     def _through(self, basis: ChebyshevProducts) -> InterpolatedTargets:
         nodes = basis.nodes()
         for p in sorted(nodes, key=lambda p: float(((p - self.center) / self.unit).norm())):
-            self.point(p)  # one beside the other, so that all are of one branch
+            self.point(p)  # in the order of neighbours, so that all are of one branch
         points = torch.stack([torch.cat([self.point(p).x, self.point(p).u]) for p in nodes])
         middle = self.point(self.center)
         return InterpolatedTargets(basis, points, torch.cat([middle.x, middle.u]), len(middle.x), self.solved)
 
     def _is_accurate(self, basis: ChebyshevProducts, tested: Tensor) -> bool:
-        """Whether the interpolated targets are those that are given, and the interpolated controls hold them."""
+        """Whether the interpolated targets have the given states, and the interpolated controls hold them."""
         targets, middle = self._through(basis), self.point(self.center)
         for p in tested:
             search, x = self._search(p), middle.x + targets.shift(p)
-            missed = [abs(float(x[i]) - value) > ACCURATE * (1 + abs(value)) for i, value in self.given(p).items()]
+            missed = [abs(float(x[i]) - value) > MAX_RATE * (1 + abs(value)) for i, value in self.given(p).items()]
             u = targets.rest(p)
             f, g = search.system.affine_model(x, u)
             rate = (f + g @ u) / search.rate
-            if any(missed) or not bool((rate.abs() <= ACCURATE).all()):
+            if any(missed) or not bool((rate.abs() <= MAX_RATE).all()):
                 return False
         return True
 

@@ -10,10 +10,10 @@ from lyapnet.base.names import joined
 from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import repeated, rows
 from lyapnet.experiment.config import CostConfig
-from lyapnet.task.cost import COSTS, MATRICES, Cost, DiagonalWeights, MadeOfAnother, QuadraticCost
+from lyapnet.task.cost import COSTS, MATRICES, Cost, CostWrapper, DiagonalWeights, QuadraticCost
 from lyapnet.task.systems import ControlSystem
 
-PREFIXES = ("cost.", *(f"{matrix}_" for matrix in MATRICES))  # of names that are weights, or numbers of the system
+PREFIXES = ("cost.", *(f"{matrix}_" for matrix in MATRICES))  # prefixes of names of weights
 
 
 class Weight(NamedTuple):
@@ -24,7 +24,7 @@ class Weight(NamedTuple):
 
 
 def named(parameters: Mapping[str, Any], system: ControlSystem) -> dict[str, Any]:
-    """Parameters of a family with each weight under one name, as R_torque for cost.R.0 and cost.R.torque.
+    """Parameters of a family with a unique name for each weight, such as R_torque for cost.R.0 and cost.R.torque.
 
     Raises:
         UsageError: a weight is named twice.
@@ -37,10 +37,10 @@ def named(parameters: Mapping[str, Any], system: ControlSystem) -> dict[str, Any
 
 
 def weights_among(names: Iterable[str], system: ControlSystem) -> dict[str, Weight]:
-    """The weights of the cost among names that a config gives for a family, by the one name of each.
+    """The weights of the cost among the names in a family's config, by their unique names.
 
     Raises:
-        UsageError: a name is like that of a weight, but there is none.
+        UsageError: a name has the form of a weight, but there is no such weight.
     """
     spellings, weights = _spellings(system), weights_of(system)
     for name in names:
@@ -60,7 +60,7 @@ def weights_of(system: ControlSystem) -> dict[str, Weight]:
 
 
 def _spellings(system: ControlSystem) -> dict[str, str]:
-    """cost.R.0, cost.R.torque and R_torque ↦ R_torque; without the last where a number of the system has that name."""
+    """cost.R.0, cost.R.torque and R_torque ↦ R_torque; the last is left out if it is a parameter of the system."""
     found = dict[str, str]()
     for name, (matrix, i) in weights_of(system).items():
         entry = name.removeprefix(f"{matrix}_")
@@ -77,12 +77,12 @@ def weighted_matrices(
     Args:
         cost: the cost of the config.
         least: the smallest value of each weight.
-        own: whether the cost is an object of the user's instead.
+        own: whether the cost is the user's object instead.
 
     Raises:
         UsageError: the cost has no such matrices in the config, or a matrix is not definite with the smallest weights.
     """
-    while isinstance(cost, MadeOfAnother):
+    while isinstance(cost, CostWrapper):
         cost = cost.cost
     names = ", ".join(weights)
     if own or config.name not in COSTS or not isinstance(cost, QuadraticCost):
@@ -97,7 +97,7 @@ def weighted_matrices(
 
 
 def with_weights(config: CostConfig, values: Mapping[Weight, float], system: ControlSystem) -> dict[str, Any]:
-    """The matrices of a quadratic cost as rows, with values of some weights; those without weights are left out."""
+    """The matrices of a quadratic cost that have weights, as rows, with given values of the weights."""
     matrices = dict[str, list[list[float]]]()
     for (matrix, i), value in values.items():
         written = rows(matrix, repeated(getattr(config, matrix), system.m if matrix == "R" else system.n))

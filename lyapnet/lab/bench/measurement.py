@@ -28,7 +28,7 @@ class BenchRow:
     route: str
     compiled: bool
     dtype: str
-    seconds: float  # median, for one loss and its gradient; for the closed loop alone, of the rollout routes
+    seconds: float  # median time of one loss with its gradient, or of the closed loop alone for route rollout
     steps_per_second: float  # environment steps: batch · N / seconds
     peak_bytes: int | None  # beyond the model; None: not torch's memory
     relative_error: float | None  # ‖gradient − reference‖ / ‖reference‖; None: no gradient
@@ -49,7 +49,7 @@ def time_routes(
     """
     x0 = case.sample(batch)
     ready = list(entries(case, x0, routes, say))
-    gradients = [entry.flat and entry.flat(entry.run()) for entry in ready]  # and caches are warm
+    gradients = [entry.flat and entry.flat(entry.run()) for entry in ready]  # this first call also fills the caches
     errors = _errors(gradients, case, x0)
     peaks = [None if entry.route in JAX_ROUTES else peak_bytes(entry.run) for entry in ready]
     turns = [[timed(entry.run)[1] for entry in ready] for _ in range(repeats)]

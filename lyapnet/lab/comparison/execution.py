@@ -57,7 +57,7 @@ def run_job(job: Job, console: Console) -> Result:
 
 
 def require_same(job: Job) -> None:
-    """Check that a job is the one that its folder was made for.
+    """Check that the folder of a job belongs to the same job.
 
     Raises:
         UsageError: the folder belongs to another job.
@@ -104,7 +104,9 @@ def _with_defaults(kept: dict[str, Any]) -> dict[str, Any]:
 
 
 def _lyapnet(job: Job, console: Console) -> Result:
-    from lyapnet.training.experiment import train  # Lightning takes seconds to import: baselines do without
+    from lyapnet.training.experiment import (
+        train,
+    )  # imported here because Lightning takes seconds, and baselines do not need it
 
     config, bounded, states, increments = job.config, job.bounded, *_states(job)
     point = Point(Path(job.compared.config), job.settings)
@@ -143,13 +145,16 @@ def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
 
 
 def _validations(run: TrainingRun, steps: int, before: float) -> list[Measurement]:
-    """The validations in metrics.csv of a run with `steps` environment steps in an iteration, and `before` seconds of
-    work before it.
+    """The validations of a run, from its metrics.csv.
+
+    Args:
+        steps: environment steps in an iteration.
+        before: seconds of work before the first iteration.
 
     Raises:
-        LyapnetError: the run has none there.
+        LyapnetError: the file has no validations.
     """
-    from lyapnet.training.metrics_file import METRICS, STEP, read_curves  # with Lightning, as above
+    from lyapnet.training.metrics_file import METRICS, STEP, read_curves  # imported here because it imports Lightning
 
     names = ("trajectory_cost/val", STEP, "training_seconds", "optimality_gap/val", "constraint_loss/val")
     validations = [
@@ -182,7 +187,7 @@ def _baseline(job: Job, console: Console) -> Result:
 def _planner(job: Job, console: Console) -> Result:
     bounded, states, increments = job.bounded, *_states(job)
     controller = None
-    if job.method.startswith(WITH_VALUE):  # another job's, which waits for a process that is at it
+    if job.method.startswith(WITH_VALUE):  # V is that of another job, which run_job completes first
         trained = run_job(replace(job, method=OURS, seed=0), console)
         controller = _controller(job, Path(trained.checkpoint))
     began = time.process_time()

@@ -15,7 +15,7 @@ from lyapnet.lab.identification.estimation import Fit, Point, Solution
 from lyapnet.lab.identification.measurements import Measurements
 from lyapnet.lab.identification.shooting import SEGMENT, Shooting
 from lyapnet.lab.identification.unknown_system import UnknownSystem
-from lyapnet.task.problem import TRIED
+from lyapnet.task.problem import TEST_STATES
 from lyapnet.task.systems import states_that_are_rates
 from lyapnet.training.stage_messages import StageReport
 
@@ -117,7 +117,7 @@ class Search:
         measured = {i: k for k, i in enumerate(self.readings.indices) if i < self.unknown.system.n}
         for i, k in measured.items():
             x[:, i] = np.unwrap(piece.y[:, k]) if i in self.unknown.system.angles else piece.y[:, k]
-        some = self.unknown.box.sample(TRIED, torch.Generator().manual_seed(0)).double()
+        some = self.unknown.box.sample(TEST_STATES, torch.Generator().manual_seed(0)).double()
         for i, j in states_that_are_rates(self.unknown.system, some):
             if j in measured and i not in measured and len(piece) > 2:
                 slope = np.gradient(x[:, j], piece.t)

@@ -14,7 +14,7 @@ from lyapnet.experiment.assembly.problem import build_initial_states, build_syst
 from lyapnet.experiment.config import Config
 from lyapnet.lab.identification.measurements import NamedReadings
 from lyapnet.lab.identification.shooting import Model
-from lyapnet.task.problem import TRIED
+from lyapnet.task.problem import TEST_STATES
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlSystem
 
@@ -92,10 +92,10 @@ class UnknownSystem:
         """
         cls, name, p = type(self.system).__name__, self.names[i], torch.from_numpy(self.before)
         generator = torch.Generator().manual_seed(0)
-        x = self.box.sample(TRIED, generator).double()
+        x = self.box.sample(TEST_STATES, generator).double()
         beside = ASIDE * x.abs().where(x != 0, 1.0) * torch.rand(x.shape, generator=generator, dtype=torch.float64)
         x = torch.where(self.box.widths > 0, x, x + beside)  # at a fixed state of 0, its factors would have no effect
-        u = torch.rand(TRIED, self.system.m, generator=generator, dtype=torch.float64)
+        u = torch.rand(TEST_STATES, self.system.m, generator=generator, dtype=torch.float64)
         slight = torch.zeros_like(p)
         slight[i] = SLIGHT * (abs(float(p[i])) or 1.0) * (-1 if p[i] < 0 else 1)
 

@@ -41,11 +41,11 @@ class Range:
 
     @property
     def extremes(self) -> list[str]:
-        """The values to check; if they are valid, all are."""
+        """The ends of the range; if they are valid, all values are."""
         return [str(self.low), str(self.high)]
 
-    def drawn(self, value: Any) -> Any:
-        """A value of a config as a value of the distribution; None if it is outside."""
+    def value_in_space(self, value: Any) -> Any:
+        """The value of the distribution for a value of the config; None if it is outside the range."""
         inside = isinstance(value, int | float) and self.low <= value <= self.high
         return value if inside else None
 
@@ -74,7 +74,7 @@ class Choice:
     def extremes(self) -> Sequence[str]:
         return self.values
 
-    def drawn(self, value: Any) -> Any:
+    def value_in_space(self, value: Any) -> Any:
         return text if (text := _text(value)) in self.values else None
 
     def text(self, value: str) -> str:
@@ -122,7 +122,7 @@ def standard_space(config: Config) -> list[Dimension]:
 
 def given_values(config: Config, space: Sequence[Dimension]) -> dict[str, Any] | None:
     """The config's own values as values of the distributions; None if one of them is outside."""
-    values = {one.key: one.drawn(value_of(config, one.key)) for one in space}
+    values = {one.key: one.value_in_space(value_of(config, one.key)) for one in space}
     return None if None in values.values() else values
 
 

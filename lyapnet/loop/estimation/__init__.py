@@ -1,1 +1,1 @@
-"""States that are not measured: their estimates from noisy readings, and whether readings tell them."""
+"""Estimates of states from noisy readings, and whether the readings determine the states."""

@@ -9,7 +9,7 @@ from torch import Tensor
 from lyapnet.base.types import ControlPath, StatePath
 from lyapnet.loop.estimation.kalman import Deviations, ExtendedKalmanFilter
 
-SEEN = 1e-6  # displacement of all readings by a direction of x₀, in their noise, from which it counts as seen
+SEEN = 1e-6  # least change of all readings, in units of their noise, by a direction of x₀ that counts as seen
 
 
 class Observability(NamedTuple):
@@ -32,8 +32,8 @@ def observability(
     """The observability along closed loops x (N + 1, b, n), u (N, b, m).
 
     Args:
-        deviation: standard deviation of each component of x₀ before any reading; 0 for those that are known, which
-            do not count in rank and condition.
+        deviation: standard deviation of each component of x₀ before any reading; 0 for known components, which do
+            not count in rank and condition.
     """
     A = kalman.step_jacobian(x[:-1], u)
     H, Q = kalman.output_jacobian(x), kalman.process_noise(x[:-1])
@@ -45,7 +45,7 @@ def observability(
             phi, P = A[k - 1] @ phi, A[k - 1] @ P @ A[k - 1].mT + with_noise * Q[k - 1]
         seen.append(H[k] @ phi / kalman.outputs.noise[:, None])
         P = kalman.corrected(P, H[k].expand(2, -1, -1, -1))[0]
-    roots = torch.linalg.svdvals(torch.cat(seen, -2))  # of W, (b, n)
+    roots = torch.linalg.svdvals(torch.cat(seen, -2))  # √ of the eigenvalues of W, (b, n)
     rounding = torch.finfo(roots.dtype).eps * roots.shape[-1] * roots[:, :1]
     rank = (roots > rounding.clamp_min(SEEN)).sum(-1)
     condition = (roots[:, 0] / roots[:, -1].where(rank == roots.shape[-1], 0.0)).square()

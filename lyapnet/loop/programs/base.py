@@ -76,10 +76,10 @@ class Program(ABC):
             mean_over_processes: the mean of a number over all processes that share the batch. With it they use the same
                 normalisation, so that the mean of their gradients is the gradient on the joint batch.
             spread_of_costs: replaces the mean cost in a task without a goal; None for a task with a goal.
-            on_model: the trajectories of the model. Of others, on plants that differ, only the cost J counts, since V
-                is the value function of the model.
-            weights: those of the trajectories in the mean of J, with a mean of one; all zero: J has no derivative;
-                None: all one.
+            on_model: the trajectories of the model. Those on other plants count only by their cost J, because V is the
+                value function of the model.
+            weights: weights of the trajectories in the mean of J, with mean one; None: all one; all zero: J has no
+                derivative.
 
         Raises:
             ValueError: no V defines the control law.

@@ -54,9 +54,9 @@ class RegionProgram(Program):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 < self.share <= 1:
-            raise ValueError(f"Expected share in (0, 1], got {self.share}; V cannot pay for more than the cost.")
+            raise ValueError(f"Expected share in (0, 1], got {self.share}; V cannot decrease by more than the cost.")
         if not self.growth >= 0:
-            raise ValueError(f"Expected growth ≥ 0, got {self.growth}; the region is to grow.")
+            raise ValueError(f"Expected growth ≥ 0, got {self.growth}; a negative weight would shrink the region.")
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
         return rate + self.share * running

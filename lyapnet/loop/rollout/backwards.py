@@ -30,7 +30,7 @@ class PathWithDerivatives(NamedTuple):
 
     @property
     def columns(self) -> list[Tensor]:
-        """The fields that there are."""
+        """The fields that are not None."""
         return [column for column in self if column is not None]
 
 

@@ -187,7 +187,7 @@ class DiscreteAdjoint:
                 self._routines[key] = self._work(x0).traced()
             except UntraceableError as error:
                 if not self._has_warned:
-                    _LOG.warning("%s It runs as it is written, which is slower.", error)
+                    _LOG.warning("%s It runs without being traced, which is slower.", error)
                     self._has_warned = True
                 self._routines[key] = self._eager_routines(x0)
         return self._routines[key]

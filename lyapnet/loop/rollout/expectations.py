@@ -1,4 +1,4 @@
-"""What noise adds to V along a path: its unpredicted part in each step, of mean zero."""
+"""The effect of noise on V along a path: its unpredicted part in each step, with mean zero."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,9 +14,9 @@ from lyapnet.task.noise import Increments, Noise, once_if_constant
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.risk import risk_matrix
 
-MOST_SOURCES = 8  # sources of noise up to which an expectation is one over 2k points
-DIRECTIONS = 4  # pairs of random points with more sources
-STATES_PER_BLOCK = 4096  # states at which V is evaluated at once without a gradient; their hidden layers fit a cache
+MOST_SOURCES = 8  # largest number k of sources of noise for expectations by 2k points
+DIRECTIONS = 4  # number of pairs of random points for more sources
+STATES_PER_BLOCK = 4096  # states at which V is evaluated at once without a gradient; hidden layers then fit a cache
 
 
 def expected_value(V: ValueFunction, noise: Noise, t: Time, mean: State, x: State, dt: float) -> PerState:
@@ -33,20 +33,21 @@ def certainty_equivalent(
 ) -> PerState:
     """(1/θ) log E exp(θ V(t, mean + σ(x)ΔW)) over ΔW.
 
-    With m(δ) = c + pᵀδ + ½ δᵀHδ for V(mean + δ), H being V's own model of its curvature or zero, and Q the normal law
-    of ΔW that exp(θm) tilts, with mean w = θΔt S⁻¹σᵀp and covariance Δt S⁻¹,
+    Let m(δ) = c + pᵀδ + ½ δᵀHδ approximate V(mean + δ), with H the curvature known to V or zero. Let Q be the normal
+    distribution whose density is proportional to exp(θm) times that of ΔW; its mean is w = θΔt S⁻¹σᵀp, its covariance
+    Δt S⁻¹. Then
 
         (1/θ) log E exp(θV) = m̃ + (1/θ) log E_Q exp(θ (V − m)),
 
-    where m̃ is the certainty equivalent of m (see lyapnet.value.risk). This is so for any c, p and H, which are
+    where m̃ is the certainty equivalent of m (see lyapnet.value.risk). This holds for any c, p and H, which are
     therefore constants for derivatives. E_Q is the mean over the 2k points w ± √k C_j, with C_j the columns of C and
-    CCᵀ = Δt S⁻¹: exact where V = m, to third order in ΔW elsewhere.
+    CCᵀ = Δt S⁻¹: exact if V = m, else to third order in ΔW.
     """
     with torch.no_grad():
         c, p = (each.double() for each in V.value_and_state_gradient(t, mean))
         H = V.curvature(t)
         H = p.new_zeros(p.shape[-1], p.shape[-1]) if H is None else H.double()
-    sigma = once_if_constant(noise(x)).double()  # with a small θ, what is divided by it needs the digits
+    sigma = once_if_constant(noise(x)).double()  # because results are divided by θ, which may be small
     root, failed = torch.linalg.cholesky_ex(risk_matrix(H, sigma, dt, risk))
     if failed.any():
         raise DivergenceError(
@@ -66,10 +67,10 @@ def certainty_equivalent(
 def sampled_value(
     V: ValueFunction, noise: Noise, t: Time, mean: State, x: State, increments: Sequence[Tensor], dt: float
 ) -> PerState:
-    """An unbiased sample of E V(t, mean + σ(x)ΔW) over ΔW, for noise of many sources.
+    """An unbiased estimate of E V(t, mean + σ(x)ΔW) over ΔW, for noise with many sources.
 
     It is the mean over some ΔW_i of ½ V(mean + σΔW_i) + ½ V(mean − σΔW_i) − ½ (σΔW_i)ᵀH(σΔW_i), plus ½ Δt tr(σᵀHσ),
-    with H V's own model of its curvature, or 0 if it has none: the expectation itself for a V with this curvature.
+    with H the curvature known to V, or 0: it is exact for a V with this curvature.
 
     Args:
         increments: some ΔW_i, each (*batch, k).
@@ -96,8 +97,8 @@ def surprises(
 
     With a risk θ > 0 the certainty equivalent replaces the expectation, and exp(θD_n) has mean one.
 
-    With more than MOST_SOURCES sources the expectation is a sample of it, from the increments of the same step of
-    DIRECTIONS paths of the batch, which are independent of this one's state: its own, and those of the next ones.
+    With more than MOST_SOURCES sources the expectation is estimated from the increments in the same step of DIRECTIONS
+    paths of the batch, its own and those of the next ones; they are independent of the state.
     """
     dt = float(t[1] - t[0])
 
@@ -137,7 +138,7 @@ def martingale(
 
 
 def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
-    """A function of columns over the steps; without a gradient in blocks of STATES_PER_BLOCK states."""
+    """Evaluate a function of columns over the steps, without a gradient in blocks of STATES_PER_BLOCK states."""
     if torch.is_grad_enabled():
         return function(*columns)
     steps = max(1, STATES_PER_BLOCK // max(1, columns[1][0, ..., 0].numel()))

@@ -28,7 +28,7 @@ class Trajectory(NamedTuple):
     value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), if a V defines the control law
 
     def applied(self, controls: ControlSet) -> "Trajectory":
-        """The same with the controls that act, of a trajectory whose controls are elements of U."""
+        """The trajectory with the controls that act, if its controls are elements of U; see ControlSet.applied."""
         return self._replace(u=controls.applied(self.x[:-1], self.u))
 
     def require_value(self) -> ValuePath:
@@ -62,7 +62,7 @@ class Trajectory(NamedTuple):
 
 
 class NoisyTrajectory(Trajectory):
-    """A batch of trajectories under noise, with what the noise does to V.
+    """A batch of trajectories under noise, with the effects of the noise on V.
 
     Attributes:
         martingale: M = Σ_n V_xᵀσΔW, (*batch,), of mean zero.
@@ -135,7 +135,7 @@ class Rollout(nn.Module):
     Args:
         problem, policy: problem and control law of the closed loop.
         method: a member of METHODS; None: that of the horizon. rk4 is the 3/8 rule, dopri5 chooses its own steps
-            between the nodes. A law that is made to be held is held over each step of a fixed-step method; other laws
+            between the nodes. A law for held controls is held over each step of a fixed-step method; other laws
             are evaluated as u(t, x) at every stage.
         gradient: a member of GRADIENTS.
 
@@ -150,7 +150,7 @@ class Rollout(nn.Module):
         rtol, atol: tolerances of adaptive methods.
         costate_limit: for gradient discrete, largest length of a costate relative to the median of its batch; None: no
             limit, the exact gradient (see DiscreteAdjoint).
-        held: whether u is held over each step; None: as the law is made to be.
+        held: whether u is held over each step; None: as the law requires.
 
     Raises:
         ValueError: an unknown method or gradient (torchdiffeq would only warn, or fail later); discrete with an
@@ -196,7 +196,7 @@ class Rollout(nn.Module):
         if held and gradient == "adjoint":
             raise ValueError(
                 f"Expected gradient discrete or backprop for a law that is held over steps of {method}, got adjoint; "
-                "choose one of them: the costate equation of continuous time knows nothing of a held control."
+                "choose one of them: the costate equation of continuous time does not describe a held control."
             )
         self.closed_loop, self.horizon = ClosedLoop(problem, policy), problem.horizon
         self.stepped = SteppedLoop(problem.in_steps(method=method), policy) if held else self.closed_loop

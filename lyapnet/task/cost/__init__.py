@@ -2,8 +2,13 @@
 
 from lyapnet.task.cost.base import Cost
 from lyapnet.task.cost.goal import goal_in_words, reason_for_no_goal, spread
-from lyapnet.task.cost.made_of_another import (
-    MadeOfAnother,
+from lyapnet.task.cost.penalty import PenaltyCost, closeness
+from lyapnet.task.cost.quadratic import QuadraticCost, is_quadratic
+from lyapnet.task.cost.smoothed import SmoothedCost
+from lyapnet.task.cost.time import TimeCost, arrival_steps, squared_distance, time_cost_of
+from lyapnet.task.cost.weights import MATRICES, DiagonalWeights, with_matrices
+from lyapnet.task.cost.wrappers import (
+    CostWrapper,
     ObstacleCost,
     PeriodicCost,
     PseudoHuberCost,
@@ -13,11 +18,6 @@ from lyapnet.task.cost.made_of_another import (
     innermost,
     is_quadratic_about_target,
 )
-from lyapnet.task.cost.penalty import PenaltyCost, closeness
-from lyapnet.task.cost.quadratic import QuadraticCost, is_quadratic
-from lyapnet.task.cost.smoothed import SmoothedCost
-from lyapnet.task.cost.time import TimeCost, arrival_steps, squared_distance, time_cost_of
-from lyapnet.task.cost.weights import MATRICES, DiagonalWeights, with_matrices
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
 
@@ -25,8 +25,8 @@ __all__ = [
     "COSTS",
     "MATRICES",
     "Cost",
+    "CostWrapper",
     "DiagonalWeights",
-    "MadeOfAnother",
     "ObstacleCost",
     "PenaltyCost",
     "PeriodicCost",

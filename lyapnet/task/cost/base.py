@@ -120,9 +120,9 @@ class Cost(nn.Module, ABC):
         return best_control(self.nonquadratic, controls, W, b) if minimum is None else minimum.u
 
     def least(self, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum | None:
-        """The same control and the minimum; None where bounds read the control as it is written.
+        """The same control and the minimum, for bounds; None if these need no special rule for the control.
 
-        They do so without s and without a ball, and if a class has methods that differ from ℓ = q + uᵀWu + s(u).
+        None is returned without s and without a ball, and if a class has methods that differ from ℓ = q + uᵀWu + s(u).
         """
         if is_quadratic_between_limits(self.nonquadratic, controls) or self.has_methods_of_its_own:
             return None
@@ -131,7 +131,7 @@ class Cost(nn.Module, ABC):
 
     @property
     def has_methods_of_its_own(self) -> bool:
-        """Whether methods that follow from q, R and s are those of a subclass."""
+        """Whether a subclass overrides methods that follow from q, R and s."""
         methods = ("running", "smooth_running", "beside", "best_control", "control")
         return any(getattr(getattr(self, name), "__func__", None) is not getattr(Cost, name) for name in methods)
 

@@ -234,7 +234,9 @@ class NormCost(ControlCost):
         super().__init__()
         self.register_buffer("weight", _weights(weight), persistent=False)
         if self.weight.ndim:
-            raise ValueError(f"Expected one weight of the norm, got {weight!r}; it is of all controls together.")
+            raise ValueError(
+                f"Expected one weight of the norm, got {weight!r}; it is a factor of the norm of all controls."
+            )
 
     def forward(self, u: Control) -> PerState:
         return self.weight * norm(u)
@@ -287,7 +289,7 @@ class ControlCosts(nn.Module):
             value = value + cost(u)
         return value
 
-    def told_apart(self, m: int) -> Control:
+    def distinguishing_controls(self, m: int) -> Control:
         """Controls (2m, m) at which different sums have different costs: single controls at two sizes."""
         each = torch.eye(m, dtype=torch.float64)
         for end in self.open_limits:

@@ -43,7 +43,7 @@ def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "
 def goal_in_words(cost: Cost, goal: Float[Tensor, " n"]) -> str:
     """Describe the goal, and say if it is only the default."""
     if cost.goal is None:
-        return "the origin, which stands in for a target: nobody named one"
+        return "the origin, the default, because no target is named"
     return f"the goal {_format_vector(goal)}"
 
 

@@ -72,11 +72,11 @@ def _numbers(part: nn.Module) -> Iterator[str]:
 
 
 def traced_minimum(costs: ControlCosts | None, controls: ControlSet, W: ControlMatrix, b: Control) -> Minimum | None:
-    """The minimum by the operator; None unless a trace with this operator is being made, and it supports s and U."""
+    """The minimum by the operator; None outside of traces with this operator, or if it does not support s and U."""
     if not are_operators(MINIMA) or is_quadratic_between_limits(costs, controls) or is_transformed(b):
         return None
     with torch._C.DisableTorchFunction(), _disable_current_modes():  # numbers, not operations of the trace
-        named = make_known(costs, controls)
+        named = register_minimum(costs, controls)
     if named is None:
         return None
     both = LEAST(W, b, named)
@@ -87,7 +87,7 @@ _CPU = torch.device("cpu")
 _known = dict[str, dict[torch.device, Known]]()
 
 
-def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
+def register_minimum(costs: ControlCosts | None, controls: ControlSet) -> str | None:
     """Store s and U for the operator in this process; return their description, or None if they have none."""
     named = description(costs, controls)
     if named is not None and named not in _known:
@@ -95,8 +95,8 @@ def make_known(costs: ControlCosts | None, controls: ControlSet) -> str | None:
     return named
 
 
-def known_as(named: str, device: torch.device) -> Known:
-    """s and U by a description from `make_known` in this process."""
+def find_registered(named: str, device: torch.device) -> Known:
+    """s and U by the description that `register_minimum` returned in this process."""
     copies = _known[named]
     if device not in copies:
         copies[device] = copies[_CPU].to(device)
@@ -105,7 +105,7 @@ def known_as(named: str, device: torch.device) -> Known:
 
 @torch.library.custom_op("lyapnet::least", mutates_args=())
 def _least(W: Tensor, b: Tensor, named: str) -> Tensor:
-    u, value = least_over(*known_as(named, b.device), W, b)
+    u, value = least_over(*find_registered(named, b.device), W, b)
     return torch.cat([u, value[..., None]], -1)
 
 

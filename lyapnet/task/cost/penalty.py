@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.types import PerState, State
 from lyapnet.task.cost.base import Cost
-from lyapnet.task.cost.made_of_another import MadeOfAnother
+from lyapnet.task.cost.wrappers import CostWrapper
 
 
 def closeness(constraints: nn.Module, margin: Tensor, x: State) -> PerState:
@@ -16,7 +16,7 @@ def closeness(constraints: nn.Module, margin: Tensor, x: State) -> PerState:
     return (torch.relu(1 + constraints(x) / margin) ** 3).sum(-1)
 
 
-class PenaltyCost(MadeOfAnother):
+class PenaltyCost(CostWrapper):
     """Another cost plus a penalty w Σ_j max(0, 1 + h_j(x)/m_j)³ per second for constraints h(x) ≤ 0.
 
     The penalty is w at h_j = 0 and 0 for h_j ≤ −m_j. The terminal cost includes the penalty of one step. It is twice

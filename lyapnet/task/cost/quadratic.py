@@ -82,7 +82,7 @@ class QuadraticCost(Cost):
 
 
 def is_quadratic(cost: Cost) -> TypeGuard[QuadraticCost]:
-    """Whether a cost is determined by its matrices: no function of it is another, and controls cost uᵀRu alone."""
+    """Whether a cost is determined by its matrices: no function is overridden, and controls cost uᵀRu alone."""
     own = ("state", "R", "terminal", "control", "running", "smooth_running", "beside", "best_control", "ignores")
     own_functions = all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
     return own_functions and cost.nonquadratic is None

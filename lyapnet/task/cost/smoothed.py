@@ -14,10 +14,10 @@ from torch.overrides import TorchFunctionMode
 from lyapnet.base.linear_algebra import norm
 from lyapnet.base.types import PerState, State
 from lyapnet.task.cost.base import Cost
-from lyapnet.task.cost.made_of_another import MadeOfAnother
+from lyapnet.task.cost.wrappers import CostWrapper
 
 
-class SmoothedCost(MadeOfAnother):
+class SmoothedCost(CostWrapper):
     """Another cost in which each √a, |a| and ‖v‖ that vanishes at the goal is replaced by a smooth function:
     √(a + ε²) − ε, √(a² + ε²) − ε and √(‖v‖² + ε²) − ε.
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from lyapnet.base.types import PerState, State, StatePath
 from lyapnet.task.cost.base import Cost
-from lyapnet.task.cost.made_of_another import MadeOfAnother
+from lyapnet.task.cost.wrappers import CostWrapper
 
 
-class TimeCost(MadeOfAnother):
+class TimeCost(CostWrapper):
     """Another cost plus k (1 − exp(−d²/2)) per second, d² = Σ_i ((x_i − x*_i)/w_i)²: the time until d ≤ 1.
 
     Far from the goal it is k per second (0.99 k at d = 3). Near the goal it is k d²/2, so that V is smooth there, and
@@ -51,7 +51,7 @@ class TimeCost(MadeOfAnother):
 
 def time_cost_of(cost: Cost) -> TimeCost | None:
     """The cost of time that a cost contains; None if it has none."""
-    while isinstance(cost, MadeOfAnother):
+    while isinstance(cost, CostWrapper):
         if isinstance(cost, TimeCost):
             return cost
         cost = cost.cost

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lyapnet.task.cost.base import Cost
-from lyapnet.task.cost.made_of_another import MadeOfAnother
 from lyapnet.task.cost.quadratic import QuadraticCost
+from lyapnet.task.cost.wrappers import CostWrapper
 
 MATRICES = {"Q": "Q", "R": "R_constant", "Q_T": "Q_T"}  # matrix of a quadratic cost ↦ its buffer
 
@@ -37,7 +37,7 @@ class DiagonalWeights(nn.Module):
             self.register_buffer(f"fixed_{name}", fixed, persistent=False)
             self.register_buffer(f"units_{name}", units, persistent=False)
         smallest = {name: getattr(cost, buffer) for name, buffer in MATRICES.items()} | self(least)
-        QuadraticCost(**smallest)  # raises what is wrong
+        QuadraticCost(**smallest)  # raises an error for wrong matrices
 
     def forward(self, w: Float[Tensor, "*batch k"]) -> dict[str, Tensor]:
         """The matrices that have weights, by name, (*batch, n, n) or (*batch, m, m)."""
@@ -48,14 +48,14 @@ class DiagonalWeights(nn.Module):
 
 
 def with_matrices(cost: Cost, matrices: Mapping[str, Tensor]) -> Cost:
-    """A shallow copy of a quadratic cost, or of one made of it, with some of its matrices replaced.
+    """A shallow copy of a quadratic cost, or of a wrapper of one, with some of its matrices replaced.
 
     Args:
         matrices: Q, R or Q_T, each a matrix, or a batch with one for each state at which the copy is evaluated.
     """
     other = copy.copy(cost)
     other._buffers = {**cost._buffers, "R_inverse": None if "R" in matrices else cost.R_inverse}
-    if isinstance(cost, MadeOfAnother):
+    if isinstance(cost, CostWrapper):
         if "R" in matrices:
             other._buffers["R_constant"] = None
         other._modules = {**cost._modules, "cost": with_matrices(cost.cost, matrices)}

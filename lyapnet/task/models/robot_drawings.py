@@ -15,8 +15,8 @@ import numpy as np
 from lyapnet.task.models.casadi_functions import assignments
 
 MOST = 100  # largest number of bodies that are drawn
-WATER = 1000.0  # kg/m³, the density of the ball by which a point mass is drawn
-SAME = 1e-9  # largest difference of directions and positions (m) that counts as none
+WATER = 1000.0  # kg/m³, the density of the ball that represents a point mass
+SAME = 1e-9  # largest difference of directions or positions (m) that counts as rounding
 COSINE, SINE = math.cos(math.pi / 6) / 2, math.sin(math.pi / 6) / 2  # the y axis in oblique views: 30°, half as long
 # views as (axis that they look along, its two rows of (x, y, z)); the last one is oblique, for robots in space
 VIEWS = (
@@ -154,7 +154,7 @@ def _shapes(body: Body, normal: Any) -> Iterator[tuple[str, list[Any], Sequence[
 
 
 def _bodies_of_inertia(root: ET.Element) -> Iterator[Body]:
-    """Bones from each link to the joints on it; without any, the box with its mass and inertia, or a ball of water."""
+    """Lines from each link to its joints; without joints, the box with its mass and inertia, or a ball of water."""
     bearing = set[str]()
     for joint in root.findall("joint"):
         parent, (place, _) = joint.find("parent"), _origin(joint)

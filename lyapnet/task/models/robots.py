@@ -157,7 +157,7 @@ def _function(robot: Robot, friction: bool = True) -> Any:
 
 
 def _with_turns_apart(urdf: str) -> str:
-    """URDF in which a fixed joint before each prismatic one has its rotation, as adam-robotics 0.3 requires."""
+    """URDF in which a fixed joint before each prismatic one has its rotation; adam-robotics 0.3 requires this."""
     root = ET.fromstring(urdf)
     for joint in root.findall("joint"):
         if joint.get("type") == "prismatic":

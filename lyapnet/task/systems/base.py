@@ -34,8 +34,10 @@ class ControlSystem(nn.Module, ABC):
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
     constants: Sequence[int] = ()  # indices of constant states, the parameters of a family
-    contact_lengths: Sequence[str] = ()  # attributes by which contact is smooth; the search for optima begins with more
-    settings: Sequence[int] = ()  # states that are told, as no reading tells them: targets, the time on a reference
+    contact_lengths: Sequence[
+        str
+    ] = ()  # attributes with smoothing lengths of contact, which searches for optima enlarge
+    settings: Sequence[int] = ()  # states that are given, not measured: targets, the time on a reference
 
     @abstractmethod
     def dynamics(self, x: State, u: Control) -> State:
@@ -87,7 +89,7 @@ class ControlSystem(nn.Module, ABC):
         return None
 
     def recurring(self, x: State) -> State:
-        """The same state, for a law that begins anew: the time on a periodic reference without whole periods."""
+        """The state with the time on a periodic reference reduced to one period."""
         return x
 
     def holding_control(self, x: State) -> tuple[Control, State]:
@@ -130,7 +132,7 @@ class ControlSystem(nn.Module, ABC):
         """Whether the system declares noise by a method `noise(x)`.
 
         Raises:
-            UsageError: noise is an attribute, which is no method.
+            UsageError: `noise` is an attribute, not a method.
         """
         name, method = type(self).__name__, callable(getattr(type(self), "noise", None))
         if hasattr(self, "noise") and not method:
@@ -240,12 +242,12 @@ def _not_affine(system: ControlSystem) -> UsageError:
 
 
 def moving_states(system: ControlSystem) -> list[int]:
-    """The indices of the states that are neither parameters of a family nor told, as the time on a reference."""
+    """The indices of the states that are neither parameters of a family nor settings, as the time on a reference."""
     return [i for i in range(system.n) if i not in system.constants and i not in system.settings]
 
 
 def functions_of_state(system: ControlSystem, u: Control) -> dict[str, Callable[[State], Tensor]]:
-    """f(x) and g(x) by their names in messages; of a system that is not affine, ẋ under a control (m,)."""
+    """f(x) and g(x) by their names in messages; for a system that is not affine, ẋ under a control (m,)."""
     if system.affine:
         return {"f(x)": system.f, "g(x)": system.g}
     return {"dynamics(x, u)": lambda x: system.dynamics(x, u.to(x).expand(*x.shape[:-1], -1))}
@@ -258,7 +260,7 @@ def states_that_are_rates(system: ControlSystem, x: State) -> list[tuple[int, in
         x: some states (b, n).
     """
     generator = torch.Generator().manual_seed(1)
-    x = x + torch.rand(x.shape, generator=generator, dtype=torch.float64).to(x)  # states that do not differ too
+    x = x + torch.rand(x.shape, generator=generator, dtype=torch.float64).to(x)  # also in components that X₀ fixes
     u = torch.rand(*x.shape[:-1], system.m, generator=generator, dtype=torch.float64).to(x)
     rates = system.dynamics(x, u)
     return [(i, j) for i in range(system.n) for j in range(system.n) if torch.equal(rates[:, j], x[:, i])]
@@ -272,7 +274,7 @@ class MechanicalSystem(ControlAffineSystem):
     Source: Tedrake, Underactuated Robotics, ch. 1.
     """
 
-    dampings: Sequence[str] = ()  # attributes with the entries of D, which families may then vary; none: D is constant
+    dampings: Sequence[str] = ()  # attributes with the entries of D, if families may vary them; empty: D is constant
     B: Float[Tensor, "d m"]
     D: Float[Tensor, " d"]
 

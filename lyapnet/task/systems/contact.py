@@ -1,6 +1,6 @@
-"""Contact as parts of f(x): a compliant normal force and regularised friction, smooth by a stated length and speed.
+"""Contact in f(x): a compliant normal force and regularised friction, smoothed over a given length and speed.
 
-Both are averages of the sharp functions: with random ξ of density ¾(1 − ξ²) on [−1, 1],
+Both are averages of the exact functions: with random ξ of density ¾(1 − ξ²) on [−1, 1],
 
     (z)₊ = E max(0, z + ξ),    sgn(z) = E sign(z + ξ).
 
@@ -21,7 +21,7 @@ def normal_force(
 ) -> Tensor:
     """The force by which two bodies push each other apart, N = k ℓ(−d/ℓ)₊ max(0, 1 − c ḋ) ≥ 0.
 
-    It is Hunt and Crossley's force, with the depth max(0, −d) made smooth for |d| < ℓ. It differs from the sharp force
+    It is Hunt and Crossley's force, with the depth max(0, −d) made smooth for |d| < ℓ. It differs from the exact force
     by at most 3kℓ/16, at d = 0, and is equal to it for |d| ≥ ℓ. For c = 0 its derivative by d is between −k and 0.
     Without damping it conserves energy; with c > 0 it only takes energy away, and a body that meets another at a speed
     v leaves it at about v(1 − ⅔ c v).
@@ -37,7 +37,7 @@ def normal_force(
         N in N, (*batch,); it never pulls.
 
     Raises:
-        UsageError: the length is no positive number.
+        UsageError: the length is not positive.
 
     Source: Hunt, Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", Journal of Applied
     Mechanics 1975.
@@ -62,7 +62,7 @@ def friction_force(slip: Tensor, normal: Tensor, coefficient: Number, speed: Num
         the force in N, (*batch,).
 
     Raises:
-        UsageError: the speed is no positive number.
+        UsageError: the speed is not positive.
     """
     _require_positive("speed", speed)
     return -coefficient * normal * _smooth_sign(slip / speed)
@@ -83,7 +83,7 @@ def _smooth_sign(z: Tensor) -> Tensor:
 def _require_positive(name: str, value: Number) -> None:
     if not isinstance(value, Tensor) and not value > 0:
         raise UsageError(
-            f"Expected a positive {name} that contact is smooth by, got {value}; a small one, as 1e-6, is hard contact."
+            f"Expected a positive smoothing {name} of contact, got {value}; a small one, as 1e-6, is hard contact."
         )
 
 

@@ -117,7 +117,7 @@ class Formulas:
         text: the lines of assignments.
         names: names of states, controls and parameters.
         results: names that the text has to define, such as `der(state)`, in the order of the results.
-        controls: those of the names for which `affine` says whether the results are affine in them.
+        controls: the names among these for which `affine` is whether the results are affine in them.
         where: the name of the text in messages.
 
     Raises:
@@ -371,7 +371,7 @@ def _factors(operation: str, depends: Sequence[bool]) -> list[int] | None:
 def _slopes(
     operation: str, slopes: Sequence[Mapping[int, Number]], numbers: Sequence[Number], like: Tensor
 ) -> dict[int, Number]:
-    """Control ↦ slope of a result, from the slopes of its operands and from their values (factors and conditions)."""
+    """Control ↦ slope of a result, from the slopes and values of its operands."""
     columns = {j: None for each in slopes for j in each}
 
     def of(k: int, j: int) -> Number:

@@ -56,8 +56,8 @@ def starts_of(problem: Problem, Q: Objective, nominal: Control, paid: PerState, 
     """Starts of a search (k, *batch, m): the nominal control, one Newton step from it, and GROUPS for each control.
 
     For these, PLACES values between the limits of one control are compared, with the others at their nominal values.
-    Without a limit the values are up to the length of the Newton step, plus the size that costs ℓ, from the nominal
-    one.
+    Without a limit the distance of the values from the nominal one is at most the length of the Newton step plus the
+    size of a control that costs ℓ.
 
     Args:
         paid: ℓ at the nominal control, per second.

@@ -11,7 +11,7 @@ certainty equivalent of V_{n+1} (see lyapnet.value.risk), with σ constant over 
 noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
 
 Along an optimal trajectory k = 0, and V_n is the value function to second order. At a constant state, with F linearised
-and q, φ quadratic, it is the Riccati solution; of an affine system if f does not vanish there.
+and q, φ quadratic, it is the Riccati solution, of an affine system if f does not vanish there.
 
 Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search as in Tassa, Mansard, Todorov,
 "Control-limited differential dynamic programming", ICRA 2014.
@@ -43,14 +43,14 @@ STEP_SIZES = tuple(0.5**k for k in range(10))  # α of the line search
 FLOOR = 0.1  # smallest allowed eigenvalue of Q_uu, relative to that of the control cost
 ROUGH_TOLERANCE = 1e-3  # relative gain, made or expected, at which the phase without second derivatives of F ends
 GAIN_TOLERANCE = 1e-9  # relative gain of a line search at which the phase with second derivatives ends
-EXPECTED_TOLERANCE = 1e-12  # relative expected gain at which it ends
-HOPELESS_COST_RATIO = 2.0  # cost relative to a settled rival, from which on a trajectory is given up
-GRACE_ITERATIONS = 20  # first iterations in which none is given up
-SOFTNESS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # ρ of softer costs of controls, in units of that of their kinks
-NARROWING = 3.0  # factor between the distances at which consecutive costs of time end
-WIDENING_STATES = 256  # states of X₀ whose distance from the goal is that of the first
-LONGER = (300.0, 100.0, 30.0, 10.0, 3.0)  # factors of the lengths by which contacts are smooth, from soft to hard
-UNREACHED = 1e300  # cost of a path that is none of the problem, so that any trajectory found from it is better
+EXPECTED_TOLERANCE = 1e-12  # relative expected gain at which this phase ends
+HOPELESS_COST_RATIO = 2.0  # cost relative to a settled rival, above which a trajectory is abandoned
+GRACE_ITERATIONS = 20  # first iterations in which no trajectory is abandoned
+SOFTNESS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # ρ of softer costs, see _softness_of_kinks for the unit
+NARROWING = 3.0  # ratio of the distances at which consecutive costs of time end
+WIDENING_STATES = 256  # states of X₀ that give the first of these distances
+LONGER = (300.0, 100.0, 30.0, 10.0, 3.0)  # factors of the smoothing lengths of contacts, from soft to hard
+UNREACHED = 1e300  # cost of a path that is no trajectory, so that any trajectory found from it is better
 TRIES = 9  # consecutive failed line searches, each with ten times the damping, after which a trajectory is given up
 
 
@@ -67,7 +67,7 @@ class Optimum(NamedTuple):
 
 
 class Backward(NamedTuple):
-    """What a backward pass finds: the law u + k + K(x − x̄), and V along the path."""
+    """The result of a backward pass: the law u + k + K(x − x̄), and V along the path."""
 
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
@@ -129,10 +129,10 @@ def optimal_trajectories(
     Args:
         iterations: largest number of iterations of each phase.
         rivals: whether the controls are guesses from one state, of which only the best counts. Once one has settled,
-            those that cost HOPELESS_COST_RATIO times as much are given up.
+            those that cost HOPELESS_COST_RATIO times as much are abandoned.
         progress: called with the number of finished trajectories and their total, averaged over the phases.
         seconds: seconds of work after which the descent stops.
-        softer_first: whether softer costs come first where the task needs them; no if the guess is nearly optimal.
+        softer_first: whether softer costs come first if the task needs them; False if the guess is nearly optimal.
     """
     until = seconds_of_work() + seconds
     noise, problem = in_float64(problem).noise, in_float64(problem).without_noise()
@@ -177,10 +177,10 @@ class SofterCost(NamedTuple):
 
 
 def _softer_costs(problem: Problem) -> list[SofterCost]:
-    """Softer costs, each closer to that of the problem; none if it needs none.
+    """Softer costs, each closer to that of the problem; empty if it needs none.
 
-    Across a kink of a cost of controls, or between limits, an optimum jumps, and far from its goal a cost of time has
-    no slope: quadratic models tell neither.
+    At a kink of a cost of controls, and between limits, optimal controls jump; far from the goal a cost of time has no
+    slope. Quadratic models show neither.
     """
     softness, widening = _softness_of_kinks(problem), _widening_of_time(problem)
     if softness:
@@ -197,7 +197,7 @@ def _from_softer_costs(
     descend: Callable[..., "_Descent"],
     u: ControlPath,
 ) -> ControlPath:
-    """Controls that are optimal for the last of some softer costs, each sought from those of the one before.
+    """Controls that are optimal for the last of some softer costs; each search starts from the previous result.
 
     Source: Bertrand, Epenoy, "New smoothing techniques for solving bang-bang optimal control problems", Optimal Control
     Applications and Methods 2002.
@@ -217,19 +217,22 @@ def _from_softer_costs(
 def _from_softer_contact(
     problem: Problem, guess: Path, descend: Callable[..., "_Descent"], until: float
 ) -> Path | None:
-    """Paths that are optimal for contact within three times its length, from longer ones; None without contact.
+    """Paths that are optimal for contact with three times its smoothing length; None without contact.
 
-    A hard contact that is not met has no slope, and one that is met sends trajectories elsewhere; within a long length
-    it pushes from afar. At each length descents begin from the path of the length before, from the first guess and from
-    the linear law: the cheapest goes on. A path is handed on with its states, as one that the next backward pass bends
-    into a trajectory; controls alone would lead elsewhere once the forces differ.
+    A hard contact that does not occur has no slope, and one that occurs changes trajectories abruptly; with a long
+    smoothing length it acts from a distance. The search proceeds from long lengths to short ones. At each length
+    descents begin from the path of the length before, from the first guess and from the linear law, and the cheapest
+    result is used. A path is passed on with its states, as an initial guess that need not be a trajectory: controls
+    alone would lead elsewhere when the forces change.
     """
     softer = copied(problem)
     lengths = variable_lengths(softer)
     if not lengths:
         return None
     programs, best = StepPrograms(softer, STEP_SIZES), None
-    share = (until - seconds_of_work()) / (2 * 3 * len(LONGER))  # all of them take at most half of what is left
+    share = (until - seconds_of_work()) / (
+        2 * 3 * len(LONGER)
+    )  # all of them together take at most half of the remaining time
     for factor in LONGER:
         for length, value in lengths:
             length.fill_(factor * value)
@@ -241,19 +244,19 @@ def _from_softer_contact(
 
 
 def _as_guess(path: Path) -> Path:
-    """A path that need not be a trajectory, for a descent to begin with."""
+    """A path that need not be a trajectory, as the start of a descent."""
     return path._replace(cost=path.cost.where(~path.cost.isfinite(), UNREACHED))
 
 
 def _reached(descent: "_Descent") -> Path:
-    """Where a descent ended, with an infinite cost where it found no trajectory."""
+    """The result of a descent, with an infinite cost if it found no trajectory."""
     now = descent.now
     return now._replace(cost=now.cost.where(now.cost < UNREACHED, torch.inf))
 
 
 @torch.no_grad()
 def _widening_of_time(problem: Problem) -> float:
-    """The distance of X₀ from the goal, in those at which a cost of time ends; 1 without such a cost."""
+    """The distance of X₀ from the goal, in units of that at which a cost of time ends; 1 without such a cost."""
     if time_cost_of(problem.cost) is None:
         return 1.0
     x0 = problem.initial_states.sample(WIDENING_STATES, torch.Generator().manual_seed(0)).to(problem.goal)
@@ -327,7 +330,7 @@ class _Descent:
         """The trajectories with their expansions; those without a stored backward pass get one now.
 
         Args:
-            noise: σ, which the stored passes leave out.
+            noise: σ, which the stored passes ignore.
         """
         has_no_pass = torch.ones_like(self.now.cost, dtype=torch.bool)
         passes = self._passes if noise is None else []
@@ -457,7 +460,7 @@ def backward_recursion(
 def _spread_and_maps(problem: Problem, noise: Noise, x: StatePath) -> tuple[Tensor | None, Tensor | None]:
     """(Δt σσᵀ, None) for a constant σ, else (None, S): √Δt (σ_j, ∂σ_j/∂x), (N, *batch, k, n, 1 + n).
 
-    S maps (1, δx) to the displacement by each column σ_j of σ. Where σ has no finite slope, as √x at 0, it is taken as
+    S maps (1, δx) to the displacement by each column σ_j of σ. If σ has no finite slope, as √x at 0, it counts as
     constant.
     """
     dt = problem.horizon.dt

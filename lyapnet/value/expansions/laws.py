@@ -39,10 +39,10 @@ class Expansion(NamedTuple):
 
 
 def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
-    """The expansion of what a law minimises: V itself, or in a task with risk its certainty equivalent over a step.
+    """The expansion of the function that a law minimises: V, or with risk its certainty equivalent over a step.
 
     Args:
-        expansion: of V; the value at its first node and its c are left as they are, as no law needs them.
+        expansion: the expansion of V; its first node and its c are not changed, because no law needs them.
     """
     if problem.noise is None or not problem.risk:
         return expansion
@@ -58,11 +58,11 @@ def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tens
     s, −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with
     others u also changes q within the step. With a target, u − u* replaces u in uᵀRu, and f + gu* replaces f.
 
-    A system that is not control-affine has the minimiser of ∫ℓ + V(F(x, u)) itself for this quadratic V.
+    For a system that is not control-affine it is the minimiser of ∫ℓ + V(F(x, u)) for this quadratic V.
 
     Args:
         x: the state at which the step begins.
-        free: the step with the control at rest, or else with the nominal one.
+        free: the step with the control at rest, or for other systems with the nominal one.
     """
     if not problem.system.affine:
         return _control_of_quadratic(problem, x, free, V_x, H)
@@ -90,7 +90,7 @@ def step_objective(problem: Problem, x: State, free: Response, V_x: State, H: Te
 
     def Q(u: Control) -> PerState:
         moved, cost = problem.smooth_rates(x.expand(*u.shape[:-1], -1), u)
-        delta = moved - rate  # not of next states, whose rounding would be larger
+        delta = moved - rate  # the difference of next states would have larger rounding errors
         return cost + (V_x * delta).sum(-1) + dt / 2 * (apply(H, delta) * delta).sum(-1)
 
     return Q

@@ -78,7 +78,7 @@ def expansion_of_another_way(
     Args:
         known: an expansion; the result costs less than its law under the same noise, by MIN_GAIN_OF_A_WAY.
         guesses: laws (n, x_n) ↦ u_n, each for another way.
-        generator: of the states and of the noise, the same for all.
+        generator: draws the states and the noise, which are the same for all guesses.
     """
     loops = _Loops(problem, LOOPS_OF_A_WAY, generator)
     if len(guesses) * loops.entries > MAX_ENTRIES:
@@ -138,9 +138,9 @@ class _Loops:
 
         Args:
             path: the first loops of each group.
-            law: the expansions whose laws gave them, one for each group; None: other laws did.
-            convex: whether E l_zz loses its negative part. A V without it is less exact, but its law leads on from any
-                loops, where the other may be wild.
+            law: the expansions whose laws gave these loops, one for each group; None: other laws gave them.
+            convex: whether to leave out the negative part of E l_zz. V is then less exact, but its law is reasonable
+                for any loops, whereas the law of the exact V may lead far away.
         """
         cost, size = self.costs(path), len(self.x0)
         going, least = torch.arange(len(cost)), torch.full_like(cost, torch.inf)
@@ -177,7 +177,7 @@ def _around(problem: Problem, path: Path, size: int, later: Expansion | None, co
 
     Args:
         size: number of loops in a group.
-        later: expansions, one for each group, whose H weighs what F̂ leaves of F; None: nothing does.
+        later: expansions, one for each group, whose H weighs the error F − F̂; None: the error has no weight.
         convex: see `descend`.
     """
     derivatives = StepDerivatives(problem.step, problem.system.n)

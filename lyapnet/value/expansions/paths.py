@@ -14,7 +14,7 @@ from lyapnet.task.problem import Problem
 
 
 class Path(NamedTuple):
-    """A batch of trajectories. If one is not finite, its J_N is infinite, and x and u have numbers instead of NaN."""
+    """A batch of trajectories. If one is not finite, its J_N is infinite, and finite numbers replace NaN in x and u."""
 
     x: StatePath
     u: ControlPath

@@ -38,7 +38,7 @@ def table(x):
 )
 def test_jumps_are_found_with_line_state_and_size(function, place, size):
     (jump,) = jumps(function, LOW, HIGH)
-    words = jump.told("f", ["p", "v"])
+    words = jump.described("f", ["p", "v"])
     assert place in words
     assert "test_jumps.py:" in words
     assert jump.size == pytest.approx(size, rel=1e-4)

@@ -45,7 +45,7 @@ KINDS = {
 def _few_steps():
     """Of a law that looks ahead, each of which is traced and written."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.value.policy.STEEP", 2)
+        patch.setattr("lyapnet.value.policy.DESCENTS_WITH_CONSTRAINTS", 2)
         yield
 
 

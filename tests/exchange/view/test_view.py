@@ -55,7 +55,9 @@ def _written_once():
     """What a page computes is traced and written once for each controller, as it takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page, "functions_of", cache(page.functions_of))
-        patch.setattr("lyapnet.value.policy.STEEP", 2)  # steps of a law that looks ahead, each of which is in the page
+        patch.setattr(
+            "lyapnet.value.policy.DESCENTS_WITH_CONSTRAINTS", 2
+        )  # steps of a law that looks ahead, each of which is in the page
         yield
 
 

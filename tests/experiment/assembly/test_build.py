@@ -13,7 +13,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims.preconditions import over_time
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import resolve
-from lyapnet.experiment.assembly.named_parts import python_of
+from lyapnet.experiment.assembly.named_parts import python_expression
 from lyapnet.experiment.config import config_from_plain, load_config, to_plain
 from lyapnet.loop.programs import LyapunovProgram, RegionProgram, ValueProgram
 from lyapnet.prover.bounds import BoundedFunction
@@ -357,7 +357,7 @@ def test_parts_of_the_users_own_as_python():
         "program": {"name": "hangar:Program", "constraint": 2, "parameters": {"power": 3}},
     }
     config = config_from_plain({**yaml.safe_load(PLAIN), **changes})
-    assert python_of(config, "system") == "hangar.Drone(mass=0.5, names=['a'])"
-    assert python_of(config, "network") == "hangar.nets.Small"
-    assert python_of(config, "program").startswith("hangar.Program(")
-    assert {"constraint=2.0", "power=3)"} <= {*python_of(config, "program").partition("(")[2].split(", ")}
+    assert python_expression(config, "system") == "hangar.Drone(mass=0.5, names=['a'])"
+    assert python_expression(config, "network") == "hangar.nets.Small"
+    assert python_expression(config, "program").startswith("hangar.Program(")
+    assert {"constraint=2.0", "power=3)"} <= {*python_expression(config, "program").partition("(")[2].split(", ")}

@@ -129,5 +129,7 @@ def test_equations_have_both_by_name():
 @pytest.mark.parametrize("text", ["normal_force(x, y, 100, 0, 0)", "friction_force(x, y, 1, -0.1)"])
 def test_no_length_is_refused(text):
     system = defined(f"der(x) = {text}\nder(y) = u", dict.fromkeys("xy", ""), {"u": ""})()
-    with pytest.raises(UsageError, match=r"Expected a positive (length|speed) .+, got -?0\.[01]; .+\."):
+    with pytest.raises(
+        UsageError, match=r"Expected a positive smoothing (length|speed) of contact, got -?0\.[01]; .+\."
+    ):
         system.f(torch.zeros(2))

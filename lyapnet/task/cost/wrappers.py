@@ -1,4 +1,4 @@
-"""Costs composed of another cost: with a target, periodic angles, slower growth far away, or obstacles."""
+"""Costs that change another cost: with a target, periodic angles, slower growth far away, or obstacles."""
 
 import math
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from lyapnet.task.cost.control_costs import ControlCosts
 from lyapnet.task.cost.quadratic import is_quadratic
 
 
-class MadeOfAnother(Cost):
-    """A cost that passes everything on to another cost; subclasses change its goal, R(x), q or φ."""
+class CostWrapper(Cost):
+    """A cost that equals another cost; subclasses change its goal, R(x), q or φ."""
 
     cost: Cost
     nonquadratic: ControlCosts | None
@@ -51,7 +51,7 @@ class MadeOfAnother(Cost):
         return self.cost.ignores_at_end(i, n)
 
 
-class TargetCost(MadeOfAnother):
+class TargetCost(CostWrapper):
     """Another cost moved to a target: q(x − d) + (u − u*)ᵀR(x)(u − u*) and φ(x − d), d = x* − goal of that cost.
 
     Args:
@@ -98,7 +98,7 @@ def is_quadratic_about_target(cost: Cost) -> bool:
     return is_quadratic(cost) and cost.goal is None
 
 
-class PeriodicCost(MadeOfAnother):
+class PeriodicCost(CostWrapper):
     """Another cost made 2π-periodic in some angles: their distance δ from the goal is replaced by 2 sin(δ/2).
 
     δ² becomes 2(1 − cos δ), which agrees with δ² near the goal.
@@ -128,7 +128,7 @@ class PeriodicCost(MadeOfAnother):
         return self.cost.terminal(self._chords(x))
 
 
-class PseudoHuberCost(MadeOfAnother):
+class PseudoHuberCost(CostWrapper):
     """Another cost with q replaced by h(q) = 2δ²(√(1 + q/δ²) − 1), and φ likewise.
 
     h(q) ≈ q for √q far below δ, and h(q) ≈ 2δ√q far above it, a norm if q is quadratic. States far away then weigh
@@ -162,7 +162,7 @@ class PseudoHuberCost(MadeOfAnother):
         return 2 * q / (torch.sqrt(1 + q / self.delta**2) + 1)
 
 
-class RegulatorTail(MadeOfAnother):
+class RegulatorTail(CostWrapper):
     """Another cost with φ(x) = (x − x*)ᵀP(x − x*), the infinite-horizon cost of a linear-quadratic regulator from x.
 
     Args:
@@ -171,7 +171,7 @@ class RegulatorTail(MadeOfAnother):
     """
 
     P: Float[Tensor, "n n"]
-    words: str = "with what a regulator goes on to pay as φ"
+    words: str = "with the cost of a regulator after T as φ"
 
     def __init__(self, cost: Cost, P: Tensor):
         super().__init__(cost)
@@ -190,8 +190,8 @@ class RegulatorTail(MadeOfAnother):
         return not any(self.P[i])
 
 
-class RegulatorsTail(MadeOfAnother):
-    """The same for each member of a family: φ(x, p) = ‖L(p)ᵀ(x − x*(p))‖², so that P(p) = L(p)L(p)ᵀ ≥ 0 for any L.
+class RegulatorsTail(CostWrapper):
+    """RegulatorTail for a family: φ(x, p) = ‖L(p)ᵀ(x − x*(p))‖², so that P(p) = L(p)L(p)ᵀ ≥ 0 for any L.
 
     Args:
         cost: q and R, functions of (x, p).
@@ -215,7 +215,7 @@ class RegulatorsTail(MadeOfAnother):
         return not bool(self.root.coefficients[:, i].any()) if i < self.n else Cost.ignores_at_end(self, i, n)
 
 
-class ObstacleCost(MadeOfAnother):
+class ObstacleCost(CostWrapper):
     """Another cost plus w exp(−2 d²/r²) per second, a smooth bump with d the distance of some states from a centre.
 
     At the radius, d = r, the bump is 0.14 w; at 2r it is 0.0003 w.
@@ -259,6 +259,6 @@ class ObstacleCost(MadeOfAnother):
 
 def innermost(cost: Cost) -> Cost:
     """The innermost cost of a composition of TargetCost, PeriodicCost and ObstacleCost."""
-    while isinstance(cost, MadeOfAnother) and type(cost) in (TargetCost, PeriodicCost, ObstacleCost):
+    while isinstance(cost, CostWrapper) and type(cost) in (TargetCost, PeriodicCost, ObstacleCost):
         cost = cost.cost
     return cost

@@ -18,33 +18,15 @@ from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import HJBPolicy
+from tests.pages import ROOT, blocks
 
-MODULE = '''
-import torch
-from lyapnet import ControlSet
-
-
-class Limits(ControlSet):
-    """|u_i| ≤ limit; for a diagonal R."""
-
-    def __init__(self, limit: float):
-        super().__init__()
-        self.register_buffer("limit", torch.tensor(limit), persistent=False)
-
-    def minimise(self, R, b):
-        return self.project(-b / (2 * R.diagonal(dim1=-2, dim2=-1)))
-
-    def contains(self, u):
-        return (u.abs() <= self.limit).all(-1)
-
-    def project(self, u):
-        return torch.maximum(torch.minimum(u, self.limit), -self.limit)
-
+(EXAMPLE,) = [block for block in blocks("python", ROOT / "docs" / "own_system.md") if "class Limits(" in block]
+MODULE = f"""{EXAMPLE}
 
 class Tight(Limits):
     def __init__(self):
         super().__init__(0.05)
-'''
+"""
 
 YAML = """
 experiment: limited

@@ -16,33 +16,15 @@ from lyapnet.cli import main
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.value.networks import FCN, Scaling
+from tests.pages import ROOT, blocks
 
-MODULE = '''
-import torch
-from lyapnet import Cost
-
-
-class Swing(Cost):
-    """q = w (1 − cos x₁) + 0.1 x₂², R = r, φ = 5 (1 − cos x₁) + x₂²."""
-
-    def __init__(self, angle_weight: float = 10.0, effort: float = 0.5):
-        super().__init__()
-        self.angle_weight, self.effort = angle_weight, effort
-
-    def state(self, x):
-        return self.angle_weight * (1 - torch.cos(x[..., 0])) + 0.1 * x[..., 1] ** 2
-
-    def R(self, x):
-        return self.effort * torch.ones(*x.shape[:-1], 1, 1).to(x)
-
-    def terminal(self, x):
-        return 5 * (1 - torch.cos(x[..., 0])) + x[..., 1] ** 2
-
+(EXAMPLE,) = [block for block in blocks("python", ROOT / "docs" / "own_system.md") if "class Swing(" in block]
+MODULE = f"""{EXAMPLE}
 
 class Reward(Swing):
     def state(self, x):
         return -super().state(x)
-'''
+"""
 
 YAML = """
 experiment: swing

@@ -17,14 +17,17 @@ from tests.pages import ROOT
 
 needs_compilers = pytest.mark.skipif(shutil.which("g++") is None or shutil.which("cc") is None, reason="no g++ or cc")
 PAGE = (ROOT / "docs" / "tutorials" / "ros2.md").read_text(encoding="utf-8")
-FILES = dict(re.findall(r"(\S+\.(?:xml|txt|cpp|py))\b[^`]*?:\n\n```\w+\n(.*?)```", PAGE, re.DOTALL))
+PACKAGE = ROOT / "docs" / "tutorials" / "reacher_policy"
+FILES = {
+    str(path.relative_to(PACKAGE)): path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.*") if path.is_file()
+}
 BEYOND = re.search(r"--beyond (\w+)", PAGE)[1]
 NAMES = ["elbow", "gripper", "shoulder"]
 
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
-    """The package as the page has it, with the stand-ins beside it."""
+    """The package of the tutorial, with the stand-ins beside it."""
     folder = tmp_path_factory.mktemp("workspace") / "reacher_policy"
     headers = {f"../include/{name}": text for name, text in HEADERS.items()}
     for name, text in {**FILES, **headers}.items():

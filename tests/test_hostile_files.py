@@ -18,7 +18,7 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.base.files import appending
+from lyapnet.base.files import open_for_appending
 from lyapnet.cli import main
 from lyapnet.exchange.importing.onnx_file import read_onnx
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint
@@ -470,10 +470,13 @@ def test_what_is_appended_goes_through_no_link(folder):
     Path("draws.jsonl").symlink_to("victim")
     os.mkfifo("fifo")
     for path in (Path("draws.jsonl"), Path("fifo"), Path()):
-        with pytest.raises(OSError, match=r"symbolic link|fifo|No such device|directory"), appending(path) as file:
+        with (
+            pytest.raises(OSError, match=r"symbolic link|fifo|No such device|directory"),
+            open_for_appending(path) as file,
+        ):
             file.write("theirs\n")
     assert Path("victim").read_text() == "mine\n"
-    with appending(Path("victim")) as file:  # the twin
+    with open_for_appending(Path("victim")) as file:  # the twin
         file.write("more\n")
     assert Path("victim").read_text() == "mine\nmore\n"
 

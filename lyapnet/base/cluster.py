@@ -13,7 +13,7 @@ from lyapnet.base.errors import UsageError, one_line
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Any]:
+def connect_to_cluster(address: str) -> Iterator[Any]:
     """The module ray, connected to the cluster at an address.
 
     Args:

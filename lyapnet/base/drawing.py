@@ -31,6 +31,6 @@ def pixels(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())
 
 
-def numpy_of(tensor: Tensor) -> np.ndarray:
+def to_numpy(tensor: Tensor) -> np.ndarray:
     """A tensor as an array, for matplotlib."""
     return tensor.detach().cpu().numpy()

@@ -30,7 +30,7 @@ def one_line(error: BaseException | str) -> str:
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
 
 
-def raised(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Describe an error of a user's code with its line: "ValueError: no such mass (drone.py:12)"."""
     line = own_line(error)
     place = None if line is None else (line.filename, line.lineno)

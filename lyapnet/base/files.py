@@ -59,7 +59,7 @@ def read_file(path: Path, most: int | None = None) -> bytes:
 
 
 @contextlib.contextmanager
-def appending(path: Path) -> Iterator[io.TextIOWrapper]:
+def open_for_appending(path: Path) -> Iterator[io.TextIOWrapper]:
     """Open a text file for appending, creating it if necessary; links are not followed.
 
     Raises:

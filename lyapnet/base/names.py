@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 
-def joined(name: Any) -> str:
+def with_underscores(name: Any) -> str:
     """A name with _ for spaces, as configs and equations write it."""
     return str(name).replace(" ", "_")
 

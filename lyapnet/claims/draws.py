@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lyapnet.base.files import appending, digest_of_file, read_file
+from lyapnet.base.files import digest_of_file, open_for_appending, read_file
 from lyapnet.base.provenance import RUN_RECORD
 
 DRAWS = "draws.jsonl"  # file with one line for each claim from sampled states
@@ -36,7 +36,7 @@ class Draws(NamedTuple):
         line = json.dumps(entry, sort_keys=True)
         try:
             if line not in self._lines():
-                with appending(self.file) as file:
+                with open_for_appending(self.file) as file:
                     file.write(f"{line}\n")
         except OSError as error:
             return f"not recorded: {error.strerror} ({self.file.name}); other draws may not be accounted for"

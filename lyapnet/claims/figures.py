@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from torch import Tensor
 
-from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, to_numpy
 from lyapnet.base.types import State, Value
 from lyapnet.claims.funnel import ProvedFunnel
 from lyapnet.claims.reach import ProvedReach
@@ -47,7 +47,7 @@ def sampled_states(claim: CountedSuccesses, initial_states: Box, labels: Sequenc
     panel = figure.subplots()
     parts = _outcomes(claim)
     if len(axes) == 1:
-        x = [numpy_of(states[:, axes[0]]) for states, _, _, _ in parts]
+        x = [to_numpy(states[:, axes[0]]) for states, _, _, _ in parts]
         low, high = (float(side[axes[0]]) for side in (initial_states.lower, initial_states.upper))
         colours = [colour for _, _, colour, _ in parts]
         panel.hist(x, 40, range=(low, high) if high > low else None, stacked=True, color=colours)
@@ -55,7 +55,7 @@ def sampled_states(claim: CountedSuccesses, initial_states: Box, labels: Sequenc
     else:
         size = 2 + 60 / len(claim.states) ** 0.5
         for states, _, colour, marker in parts:
-            x, y = (numpy_of(states[:, i]) for i in axes)
+            x, y = (to_numpy(states[:, i]) for i in axes)
             panel.plot(
                 x, y, marker, color=colour, markersize=size if marker == "." else 4, markeredgewidth=0.8,
                 alpha=0.5 if marker == "." else 0.9, rasterized=True,
@@ -162,7 +162,7 @@ def region(
             continue
         _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
         if paths is not None:
-            x, y = (numpy_of(paths[..., k]) for k in pair)
+            x, y = (to_numpy(paths[..., k]) for k in pair)
             name = f"closed loops under u(0, x){', undisturbed' if claim.disturbance is not None else ''}"
             name += "" if claim.plants is None else ", each of another plant"
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
@@ -186,7 +186,7 @@ def _draw_over_state(
     states = goal.repeat(401, 1)
     states[:, i] = torch.linspace(float(claim.states.lower[i]), float(claim.states.upper[i]), 401).to(goal)
     with torch.no_grad():
-        x, value = numpy_of(states[:, i]), numpy_of(V(states.new_zeros(401), states))
+        x, value = to_numpy(states[:, i]), to_numpy(V(states.new_zeros(401), states))
     handles["V"] = panel.plot(x, value, color="black", linewidth=1.2, label="V(0, x)")[0]
     for _, level, colour, name, proved in levels:
         handles[name] = panel.axhline(level, color=colour, linestyle="-" if proved else ":", label=name)
@@ -235,7 +235,7 @@ def reach(
         levels = [*levels[:proved], wanted]
     for panel, pair in panels:
         for k, path in enumerate(paths):
-            x, y = (numpy_of(path[:, i]) for i in pair)
+            x, y = (to_numpy(path[:, i]) for i in pair)
             (line,) = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under noise")
             if not k:
                 handles.setdefault("closed loops", line)
@@ -269,14 +269,14 @@ def two_sided(
     panel = figure.subplots()
     order = value.argsort()
     order = order[(value > 0)[order] & least.isfinite()[order]]
-    V, upper, lower = (numpy_of(y[order]) for y in (value, value if guaranteed is None else guaranteed, least))
+    V, upper, lower = (to_numpy(y[order]) for y in (value, value if guaranteed is None else guaranteed, least))
     if guaranteed is not None:
         panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
         panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
     panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label=f"least: {whose} costs at least")
     if optimum is not None:
         first = order[order < len(optimum)]
-        some, best = numpy_of(value[first]), numpy_of(optimum[first])
+        some, best = to_numpy(value[first]), to_numpy(optimum[first])
         panel.plot(some, best / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
     panel.axhline(1, color=GREY, linewidth=0.6)
     middle = len(V) // 4  # states of smaller V, where δT and κ dominate the bounds, may lie outside of the picture
@@ -293,7 +293,7 @@ def margins(t: Tensor, c: Tensor, found: Counterexample | None, headline: str) -
     """c at random points (t, x) over time, the limit 0, and the counterexample if there is one."""
     figure = Figure(figsize=(5.6, 4.2), layout="constrained")
     panel = figure.subplots()
-    panel.plot(numpy_of(t), numpy_of(c), ".", color=BLUE, markersize=2, rasterized=True)
+    panel.plot(to_numpy(t), to_numpy(c), ".", color=BLUE, markersize=2, rasterized=True)
     panel.axhline(0, color=GREY, linewidth=0.8)
     if found is not None:
         panel.plot(found.t, found.condition, "x", color=VERMILION)
@@ -341,21 +341,21 @@ def _draw_slice(
     grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
     states = goal.repeat(201, 201, 1)
     states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
-    axes = [numpy_of(axis) for axis in grid]
+    axes = [to_numpy(axis) for axis in grid]
     for t, level, colour, name, proved in levels:
         with torch.no_grad():
-            excess = numpy_of(V(states.new_tensor(t).expand(201, 201), states) - level).T
+            excess = to_numpy(V(states.new_tensor(t).expand(201, 201), states) - level).T
         _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
         handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
     if constraints is not None:
-        _draw_excluded(panel, axes, numpy_of(constraints.worst(states)).T, handles)
+        _draw_excluded(panel, axes, to_numpy(constraints.worst(states)).T, handles)
     through = bool(((initial_states.lower <= goal) & (initial_states.upper >= goal))[others].all())
     name = "X₀" if through else "X₀, projected"
     box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
     handles.setdefault(name, box)
     if len(claim.undecided):
         name = "undecided, some of it" + (" (projected onto the slice)" if others else "")
-        x, y = (numpy_of(claim.undecided[:, 1 + k]) for k in pair)
+        x, y = (to_numpy(claim.undecided[:, 1 + k]) for k in pair)
         (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
         handles.setdefault(name, points)
     if claim.counterexample is not None:
@@ -416,7 +416,7 @@ def _draw_over_time(
         with torch.no_grad():
             levels = t.new_tensor([claim.level(each) for each in t.tolist()])
             excess = V(t[None].expand(201, 201), x[:, None, None].expand(201, 201, 1)) - levels
-        _draw_sublevel(panel, [numpy_of(t), numpy_of(x)], numpy_of(excess), BLUE, filled=True)
+        _draw_sublevel(panel, [to_numpy(t), to_numpy(x)], to_numpy(excess), BLUE, filled=True)
         handles["funnel"] = Patch(color=BLUE, alpha=0.4, label=f"V(t, ·) ≤ {claim.formula}")
     ends = [float(initial_states.lower[0]), float(initial_states.upper[0])]
     handles["X₀"] = panel.plot([0, 0], ends, color="black", linewidth=4, label="X₀", clip_on=False)[0]

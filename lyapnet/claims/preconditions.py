@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor, nn
 
-from lyapnet.base.contracts import Memory, called, check_function, check_memory, reaches_own_code
+from lyapnet.base.contracts import Memory, call_checked, check_function, check_memory, reaches_own_code
 from lyapnet.base.contracts.batch_sizes import check_batch_sizes
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply
@@ -63,7 +63,7 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
         return tuple(results)
 
     def call(points: Tensor) -> None:
-        called("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+        call_checked("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
 
     parts = [loop.system, loop.cost, loop.V, constraints, loop.policy, loop.noise]
     named = {type(part).__name__: part for part in parts if part is not None}

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lyapnet.base.errors import Interrupted, LyapnetError, one_line, raised, signals_taken
+from lyapnet.base.errors import Interrupted, LyapnetError, describe_error, one_line, signals_taken
 from lyapnet.cli import bench, certify
 from lyapnet.cli.animate import animate
 from lyapnet.cli.check import check
@@ -130,7 +130,7 @@ def _explain(error: Any) -> tuple[str, int]:
             return f"error: Expected a command of {command}, got {unknown[1]}; {hint}", error.exit_code
         return f"error: Expected options of {command}, got: {got.rstrip('.')}; see {command} --help.", error.exit_code
     if isinstance(error, SystemExit):
-        return f"error: Expected code of your own that returns, got {raised(error)}; take that out.", 1
+        return f"error: Expected code of your own that returns, got {describe_error(error)}; take that out.", 1
     if isinstance(error, OSError):
         return (
             f"error: {error.strerror or error}: {error.filename or 'a file of the run'}; check space and permissions.",

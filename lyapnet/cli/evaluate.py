@@ -56,7 +56,7 @@ def evaluate(
     The optimum of a linear task follows from the Riccati equation; that of any other needs CasADi, the extra oracle.
     Optima are computed once for each state and kept for later evaluations of the task.
     """
-    from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
+    from lyapnet.evaluation.after_horizon import check_multiple, loops_after_horizon, to_plain_data
     from lyapnet.evaluation.in_simulator import read_plant, simulate
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.movie import require_ending
@@ -96,7 +96,7 @@ def evaluate(
     if until is not None:
         report(f"closed loops up to {until:g} T")
         later = loops_after_horizon(controller, measured.table.x0[:count], until)
-        result["afterwards"] = in_plain_data(later, controller, until)
+        result["afterwards"] = to_plain_data(later, controller, until)
     if simulated is not None:
         report(f"closed loops in MuJoCo from {count} states")
         loops = simulate(controller, simulated, measured.table.x0[:count])

@@ -159,11 +159,11 @@ def with_controller_options(command: Callable[..., None]) -> Callable[..., None]
             report(f"importing torch for {checkpoint}")
             import torch
 
-            from lyapnet.experiment.checkpoint import located  # takes seconds
+            from lyapnet.experiment.checkpoint import locate_checkpoint  # takes seconds
 
             before = torch.get_default_dtype()
             try:
-                command(**{given: Given(located(checkpoint), own, options.pop("at"), report)}, **options)
+                command(**{given: Given(locate_checkpoint(checkpoint), own, options.pop("at"), report)}, **options)
             finally:
                 torch.set_default_dtype(before)
 

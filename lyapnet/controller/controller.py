@@ -146,7 +146,7 @@ class Controller:
         return f"{type(self).__name__}({about})"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a table, and some closed loops."""
+        """The display in notebooks: a table, and some closed loops."""
         return controller_as_html(self)
 
     @property

@@ -9,7 +9,7 @@ from typing import Any
 from lyapnet.base.errors import LyapnetError
 from lyapnet.base.files import read_json
 from lyapnet.base.provenance import EVALUATION
-from lyapnet.experiment.checkpoint import KEY, ZOO, located
+from lyapnet.experiment.checkpoint import KEY, ZOO, locate_checkpoint
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Origin:
 
     def evaluation(self) -> dict[str, Any]:
         """The evaluation at the end of its training, or that in the zoo; empty if none is recorded."""
-        file = located(self.path)
+        file = locate_checkpoint(self.path)
         with suppress(LyapnetError):
             if file.parent == ZOO:
                 return _mapping(_mapping(read_json(file.with_suffix(".json"), "")).get("evaluation"))

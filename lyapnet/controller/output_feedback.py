@@ -84,7 +84,7 @@ class OutputFeedback:
         self.reset()
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a table."""
+        """The display in notebooks: a table."""
         return loop_as_html(self)
 
     def reset(self, x_hat: Any = None, P: Any = None, t: float = 0.0) -> None:
@@ -144,7 +144,7 @@ class OutputFeedback:
 
     @property
     def t(self) -> float:
-        """Time of the last readings, in s; before the first ones that of `reset`."""
+        """Time of the last readings, in s; before the first readings the time of `reset`."""
         return self._t
 
     @property

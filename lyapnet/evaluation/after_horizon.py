@@ -96,7 +96,7 @@ def shown_nodes(controller: Controller, multiple: float) -> list[int]:
     return sorted({T, T + max((last - T) // 10, 1), T + max((last - T) // 2, 1), last})
 
 
-def in_plain_data(found: Sequence[LoopsAfterHorizon], controller: Controller, multiple: float) -> list[dict[str, Any]]:
+def to_plain_data(found: Sequence[LoopsAfterHorizon], controller: Controller, multiple: float) -> list[dict[str, Any]]:
     """Plain data for JSON and tables: the mean distance at some times in s for each law, or why there is none."""
     nodes, dt = shown_nodes(controller, multiple), controller.horizon.dt
     return [

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from matplotlib.figure import Figure
 
-from lyapnet.base.drawing import CYCLE, legend_below, numpy_of
+from lyapnet.base.drawing import CYCLE, legend_below, to_numpy
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.after_horizon import LoopsAfterHorizon
 
@@ -21,8 +21,8 @@ def distances(found: Sequence[LoopsAfterHorizon], controller: Controller) -> Fig
     drawn = {one.beyond: one.distance for one in found if one.distance is not None}
     before = max(float(distance[: controller.horizon.steps + 1].max()) for distance in drawn.values()) or 1.0
     for color, (beyond, distance) in zip(CYCLE, drawn.items(), strict=False):
-        t = numpy_of(controller.horizon.dt * torch.arange(len(distance)))
-        shown = numpy_of(distance.clamp(min=ZERO * before))
+        t = to_numpy(controller.horizon.dt * torch.arange(len(distance)))
+        shown = to_numpy(distance.clamp(min=ZERO * before))
         axes.fill_between(t, shown.min(1), shown.max(1), color=color, alpha=0.15, lw=0)
         axes.semilogy(t, shown.mean(1), color=color, linewidth=1.4, label=beyond)
     bottom, top = axes.get_ylim()

@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, to_numpy
 from lyapnet.base.shapes import Shape, corners_of
 from lyapnet.base.types import Value
 from lyapnet.evaluation.figures import Slice
@@ -49,9 +49,9 @@ class Film(Movie):
     ):
         super().__init__(float(trajectory.t[-1]), len(trajectory.t) - 1, rate, speed)
         self.problem, self.V = problem, V
-        self.t, self.x, self.u = (numpy_of(part) for part in (trajectory.t, trajectory.x, trajectory.u))
-        self.to_go = numpy_of(trajectory.cost - trajectory.running_cost)
-        self.value = numpy_of(trajectory.require_value())
+        self.t, self.x, self.u = (to_numpy(part) for part in (trajectory.t, trajectory.x, trajectory.u))
+        self.to_go = to_numpy(trajectory.cost - trajectory.running_cost)
+        self.value = to_numpy(trajectory.require_value())
         self.palette: Image.Image = _palette()
         self.figure = Figure(figsize=(8.6, 4.3), layout="constrained")
         drawn = [self._shapes(node, 0) for node in (0, len(self.u))]
@@ -111,7 +111,7 @@ class Film(Movie):
         levels = levels[np.append(True, np.diff(levels) > 0)]
 
         def draw_node(node: int) -> Iterator[Artist]:
-            coordinates = [numpy_of(line) for line in region.grid]
+            coordinates = [to_numpy(line) for line in region.grid]
             yield panel.contour(*coordinates, self._values(node, region), levels=levels, colors=GREY, linewidths=0.7)
             for loop in range(self.x.shape[1]):
                 path = self.x[: node + 1, loop][:, axes]
@@ -133,8 +133,8 @@ class Film(Movie):
         heights = torch.linspace(low - margin, high + margin, 41).to(problem.goal)[:, None]
         with torch.no_grad():
             times = [torch.as_tensor(self.t[node]).to(heights) for node in self.nodes]
-            values = np.stack([numpy_of(self.V(t, heights)) for t in times], 1)
-        panel.contour(self.t[self.nodes], numpy_of(heights[:, 0]), values, levels=9, colors=GREY, linewidths=0.7)
+            values = np.stack([to_numpy(self.V(t, heights)) for t in times], 1)
+        panel.contour(self.t[self.nodes], to_numpy(heights[:, 0]), values, levels=9, colors=GREY, linewidths=0.7)
 
         def draw_node(node: int) -> Iterator[Artist]:
             for loop in range(self.x.shape[1]):
@@ -147,7 +147,7 @@ class Film(Movie):
     def _values(self, node: int, region: Slice) -> np.ndarray:
         with torch.no_grad():
             values = self.V(torch.as_tensor(self.t[node]).to(region.states), region.states)
-        return numpy_of(values).reshape([len(line) for line in region.grid]).T
+        return to_numpy(values).reshape([len(line) for line in region.grid]).T
 
     def _panels(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
         """Draw the panels of controls and cost; return the lines that grow, with their times and values."""
@@ -162,7 +162,7 @@ class Film(Movie):
             panel.set_title(system.control_labels[k], **above)
             for limit in limits or ():
                 if limit.ndim > 1:  # of the first closed loop
-                    panel.plot(self.t[:-1], numpy_of(limit[:, 0, k]), color=GREY, linewidth=0.9, linestyle="--")
+                    panel.plot(self.t[:-1], to_numpy(limit[:, 0, k]), color=GREY, linewidth=0.9, linestyle="--")
                 elif math.isfinite(height := float(limit.expand(system.m)[k])):
                     panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
             growing += self._lines(panel, self.u[..., k], GREEN)

@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, to_numpy
 from lyapnet.controller.output_feedback import OutputFeedback
 from lyapnet.evaluation.figures import MOST_PANELS
 from lyapnet.evaluation.with_estimator import EstimatedLoops
@@ -18,19 +18,19 @@ def states_and_estimates(loops: EstimatedLoops, estimator: OutputFeedback) -> Fi
     """
     system, outputs = estimator.problem.system, estimator.outputs
     measured = {name: k for k, name in enumerate(outputs.names)}
-    t, count = numpy_of(loops.t), min(system.n, MOST_PANELS)
+    t, count = to_numpy(loops.t), min(system.n, MOST_PANELS)
     columns = 1 if count < 4 else 2
     rows = -(-count // columns)
     figure = Figure(figsize=(4.6 * columns, 1.6 * rows + 0.6), layout="constrained")
     panels = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flatten(order="F"))
     handles = dict[str, object]()
     for i, panel in enumerate(panels[:count]):
-        x, x_hat = (numpy_of(part[:, 0, i]) for part in (loops.x, loops.x_hat))
-        width = BAND * numpy_of(loops.P[:, 0, i, i].sqrt())
+        x, x_hat = (to_numpy(part[:, 0, i]) for part in (loops.x, loops.x_hat))
+        width = BAND * to_numpy(loops.P[:, 0, i, i].sqrt())
         panel.fill_between(t, x_hat - width, x_hat + width, color=ORANGE, alpha=0.3, linewidth=0, label="estimate ± 2σ")
         k = measured.get(system.state_names[i])
         if k is not None:
-            panel.plot(t, numpy_of(loops.y[:, 0, k]), ".", color=GREY, markersize=2, label="reading")
+            panel.plot(t, to_numpy(loops.y[:, 0, k]), ".", color=GREY, markersize=2, label="reading")
         panel.plot(t, x, color=BLUE, linewidth=1.6, label="state")
         panel.plot(t, x_hat, color=VERMILION, linewidth=1, linestyle="--", label="estimate")
         low, high = min(x.min(), x_hat.min()), max(x.max(), x_hat.max())

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, to_numpy
 from lyapnet.base.types import State, Value
 from lyapnet.evaluation.states import StateTable
 from lyapnet.loop.programs.terms import hinge, satisfied
@@ -91,21 +91,21 @@ def _draw_plane_region(
     trajectory: Trajectory,
 ) -> None:
     system, initial_states = problem.system, problem.initial_states
-    first, second = (numpy_of(g) for g in region.grid)
+    first, second = (to_numpy(g) for g in region.grid)
     shape = (len(first), len(second))
     levels = ["#E8A06A", "#CFE6F3"]  # distinct in greyscale too
     axes.pcolormesh(
-        first, second, numpy_of(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
+        first, second, to_numpy(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
         shading="nearest", rasterized=True,
     )  # fmt: skip
-    contour = axes.contour(first, second, numpy_of(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
+    contour = axes.contour(first, second, to_numpy(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
     axes.clabel(
         contour, list(contour.levels)[::2], fontsize=7, fmt="%.3g"
     )  # every second level: labels of neighbours overlap
     axes.use_sticky_edges = False  # keep a margin between X₀ and the frame
     i, j = region.axes
     corners = _spread(region)
-    paths = numpy_of(trajectory.x[:, corners])
+    paths = to_numpy(trajectory.x[:, corners])
     axes.plot(paths[..., i], paths[..., j], color=BLUE, linewidth=1)
     axes.plot(paths[0, :, i], paths[0, :, j], "o", color=BLUE, markersize=3)
     if problem.has_goal:
@@ -139,14 +139,14 @@ def _draw_line_region(
     V0: Tensor,
     tolerance: float,
 ) -> None:
-    x = numpy_of(region.grid[0])
+    x = to_numpy(region.grid[0])
     relative = torch.where(V0 > 0, violation / V0, torch.inf)
-    axes.semilogy(x, np.clip(numpy_of(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
+    axes.semilogy(x, np.clip(to_numpy(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
     axes.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1, label="tolerance")
     axes.set_xlabel(system.state_labels[region.axes[0]])
     axes.set_ylabel("summed violation / V(0, x₀)", color=BLUE)
     twin = axes.twinx()
-    twin.plot(x, numpy_of(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
+    twin.plot(x, to_numpy(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
     twin.set_ylabel("V(0, x₀) (cost)", color=ORANGE)
     legend_below(figure, [*axes.get_legend_handles_labels()[0], *twin.get_legend_handles_labels()[0]], columns=3)
 
@@ -169,14 +169,14 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     Dotted lines are the goals, or references, and the controls at rest. Parameters of a family have no panel.
     """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
-    t = numpy_of(trajectory.t)
+    t = to_numpy(trajectory.t)
     drawn, controls = states_and_controls_to_draw(system)
     goals, rests = trajectory.x - problem.cost.from_goal(trajectory.x), problem.rest_at(trajectory.x[:-1])
     rests = problem.controls.moved(trajectory.x[:-1], rests)
-    wanted = [numpy_of(goals[..., i]) if problem.has_goal else None for i in drawn]
-    wanted += [numpy_of(rests[..., i]) for i in controls]
-    curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
-    curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in controls]
+    wanted = [to_numpy(goals[..., i]) if problem.has_goal else None for i in drawn]
+    wanted += [to_numpy(rests[..., i]) for i in controls]
+    curves = [(system.state_labels[i], to_numpy(trajectory.x[..., i]), BLUE) for i in drawn]
+    curves += [(system.control_labels[i], to_numpy(trajectory.u[..., i]), GREEN) for i in controls]
     columns = _columns(len(curves) + 1)
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # fits a page without scaling
@@ -195,7 +195,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
                 if i in drawn:
                     panels[drawn.index(i)].axhline(height, color=VERMILION, linewidth=0.9, linestyle="--")
     for limit in problem.controls.limits_at(trajectory.x[:-1]) or ():
-        paths = numpy_of(limit.expand(*limit.shape[:-1], system.m)[..., controls])
+        paths = to_numpy(limit.expand(*limit.shape[:-1], system.m)[..., controls])
         for k, panel in enumerate(panels[len(drawn) : len(curves)]):
             if paths.ndim > 1:  # limits that depend on the state
                 panel.plot(t[:-1], paths[..., k], color=GREY, linewidth=0.5, linestyle="--")
@@ -206,7 +206,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
         ("cost to go", to_go, {"color": ORANGE}),
         ("V(t, x)", trajectory.require_value(), {"color": BLUE, "ls": "--"}),
     ):
-        lines = last.plot(t, numpy_of(paths), linewidth=0.9, **style)
+        lines = last.plot(t, to_numpy(paths), linewidth=0.9, **style)
         lines[0].set_label(name)
     last.set_ylabel("cost", fontsize=8)
     last.legend(fontsize=7, frameon=False)
@@ -242,15 +242,15 @@ def value_slices(V: Value, problem: Problem) -> Figure:
     if len(region.axes) == 1:
         axes = figure.subplots()
         for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN)[: len(times)], strict=True):
-            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=f"t = {t:.2f} s")
+            axes.plot(to_numpy(region.grid[0]), to_numpy(value), color=color, label=f"t = {t:.2f} s")
         axes.set_xlabel(system.state_labels[region.axes[0]])
         axes.set_ylabel(f"{'V(x)' if stationary else 'V(t, x)'} (cost)")
         if not stationary:
             axes.legend(frameon=False)
         return figure
-    first, second = (numpy_of(g) for g in region.grid)
+    first, second = (to_numpy(g) for g in region.grid)
     panels = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
-    surfaces = [numpy_of(value).reshape(len(first), len(second)).T for value in values]
+    surfaces = [to_numpy(value).reshape(len(first), len(second)).T for value in values]
     for panel, t, surface in zip(panels, times, surfaces, strict=True):
         filled = panel.contourf(first, second, surface, levels=_levels(surface), cmap="cividis")
         figure.colorbar(filled, ax=panel, label="V (cost)" if panel is panels[-1] else "")
@@ -271,12 +271,12 @@ def optimality(table: StateTable) -> Figure:
     """Cost and V(0, x₀) of each initial state over its optimal cost, with the line of equality."""
     assert table.optimal_cost is not None
     known = torch.isfinite(table.optimal_cost)
-    optimal = numpy_of(table.optimal_cost[known])
+    optimal = to_numpy(table.optimal_cost[known])
     figure = Figure(figsize=(8.6, 4.3), layout="constrained")
     panels = figure.subplots(1, 2)
     measured = (("J(x₀), closed loop (cost)", table.cost, BLUE, "o"), ("V(0, x₀) (cost)", table.value, VERMILION, "^"))
     for panel, (label, values, color, marker) in zip(panels, measured, strict=True):
-        y = numpy_of(values[known])
+        y = to_numpy(values[known])
         ends = [min(optimal.min(), y.min()), max(optimal.max(), y.max())]
         panel.plot(ends, ends, color=GREY, linewidth=0.9, label="equal to the optimum")
         panel.plot(optimal, y, marker, color=color, markersize=3.5, alpha=0.6, label="an initial state")

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from lyapnet.base.errors import UsageError, did_you_mean, one_line
-from lyapnet.base.names import identifier, joined
+from lyapnet.base.names import identifier, with_underscores
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.references import costs_of_plant
@@ -107,11 +107,11 @@ def read_plant(path: Path, controller: Controller, drawn: bool = False) -> Plant
     rates = {f"{name}{RATE}": int(model.jnt_dofadr[j]) for name, j in joints.items()}
     forces = {f"{name}{end}": int(model.jnt_dofadr[j]) for name, j in joints.items() for end in (TORQUE, FORCE)}
     plant = Plant(mujoco, model, [], [], [], [])
-    for i, name in enumerate(joined(name) for name in system.state_names):
+    for i, name in enumerate(with_underscores(name) for name in system.state_names):
         _add_index(
             i, name, ((states, plant.positions), (rates, plant.rates)), f"states of the controller in {path.name}"
         )
-    for i, name in enumerate(joined(name) for name in system.control_names):
+    for i, name in enumerate(with_underscores(name) for name in system.control_names):
         _add_index(
             i,
             name,

@@ -4,7 +4,7 @@ import math
 
 from torch import Tensor
 
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # confidence of the intervals
 
 
 def half_width_of_mean(samples: Tensor) -> float:

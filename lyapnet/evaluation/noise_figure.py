@@ -5,7 +5,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, legend_below, to_numpy
 from lyapnet.base.types import State
 from lyapnet.evaluation.figures import name_panels_left_out, states_and_controls_to_draw
 from lyapnet.loop.rollout import Trajectory
@@ -29,7 +29,7 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
 
     The last panel compares V, averaged over the paths, with the mean of the cost to go.
     """
-    system, t = problem.system, numpy_of(trajectory.t)
+    system, t = problem.system, to_numpy(trajectory.t)
     to_go = trajectory.cost - trajectory.running_cost
     drawn, controls = states_and_controls_to_draw(system)
     curves = [(system.state_labels[i], trajectory.x[..., i]) for i in drawn]
@@ -40,16 +40,16 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
     panels = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flatten(order="F"))
     for panel, (label, paths) in zip(panels, curves, strict=False):
         for k, color in enumerate((BLUE, ORANGE)):
-            low, middle, high = np.quantile(numpy_of(paths[..., k]), (BAND[0], 0.5, BAND[1]), axis=1)
+            low, middle, high = np.quantile(to_numpy(paths[..., k]), (BAND[0], 0.5, BAND[1]), axis=1)
             at = t[: len(middle)]
             panel.fill_between(at, low, high, color=color, alpha=0.25, linewidth=0)
             panel.plot(at, middle, color=color, linewidth=1.2, label=f"from state {k + 1}: median, 5 to 95 % of paths")
-            panel.plot(at, numpy_of(paths[:, 0, k]), color=color, linewidth=0.5, alpha=0.8)
+            panel.plot(at, to_numpy(paths[:, 0, k]), color=color, linewidth=0.5, alpha=0.8)
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
     last = panels[len(curves)]
     for k in range(STATES):
-        last.plot(t, numpy_of(to_go[..., k].mean(1)), color=GREEN, linewidth=2.2, alpha=0.6, label="mean cost to go")
-        last.plot(t, numpy_of(trajectory.require_value()[..., k].mean(1)), color=GREY, ls="--", label="mean of V")
+        last.plot(t, to_numpy(to_go[..., k].mean(1)), color=GREEN, linewidth=2.2, alpha=0.6, label="mean cost to go")
+        last.plot(t, to_numpy(trajectory.require_value()[..., k].mean(1)), color=GREY, ls="--", label="mean of V")
     last.set_ylabel("cost", fontsize=8)
     handles = [*panels[0].get_legend_handles_labels()[0], *last.get_legend_handles_labels()[0][:2]]
     name_panels_left_out(figure, system)

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, to_numpy
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import Ball, parts_of
 from lyapnet.task.cost import Cost, CostWrapper, ObstacleCost
@@ -30,7 +30,7 @@ def paths(trajectory: Trajectory, problem: Problem) -> Figure:
     figure = Figure(figsize=(5.6, 4.8), layout="constrained")
     panel = figure.subplots()
     _draw_disks(panel, problem, plane)
-    x = numpy_of(trajectory.x)
+    x = to_numpy(trajectory.x)
     for k, path in enumerate(x.swapaxes(0, 1)):
         panel.plot(path[:, i], path[:, j], color=BLUE, linewidth=0.9, label=None if k else "closed loop")
     panel.plot(x[0, :, i], x[0, :, j], "o", color=BLUE, markersize=3)

@@ -2,7 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from lyapnet.base.drawing import BLUE, GREY, ORANGE, numpy_of
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, to_numpy
 from lyapnet.evaluation.on_plants import OnPlants
 
 
@@ -14,9 +14,9 @@ def cost_against_parameters(measured: OnPlants) -> Figure:
     """
     problem, n = measured.plants.problem, measured.plants.n
     names = [problem.system.state_names[i].replace("_", " ") for i in problem.system.constants]
-    ratio, p = numpy_of(measured.ratio), numpy_of(measured.z0[:, n:])
-    finite = numpy_of(measured.cost.isfinite() & measured.ratio.isfinite())
-    lost = numpy_of(~measured.cost.isfinite())
+    ratio, p = to_numpy(measured.ratio), to_numpy(measured.z0[:, n:])
+    finite = to_numpy(measured.cost.isfinite() & measured.ratio.isfinite())
+    lost = to_numpy(~measured.cost.isfinite())
     top = float(ratio[finite].max(initial=1.0))
     figure = Figure(figsize=(2.8 * len(names) + 0.6, 2.8), layout="constrained")
     for k, (panel, name) in enumerate(

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch
 from matplotlib.patches import Polygon as Patch
 
-from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, numpy_of, pixels
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, pixels, to_numpy
 from lyapnet.base.errors import UsageError, one_line
 from lyapnet.base.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
 from lyapnet.evaluation.figures import widest_axes
@@ -37,7 +37,7 @@ class Picture:
         """Start a trajectory at x₀ (n,)."""
         box = self.problem.initial_states
         self.path, self.control = [x], np.zeros(self.problem.system.m)
-        self._seen = _corners(self.problem, [numpy_of(box.lower), numpy_of(box.upper), x], self.control)
+        self._seen = _corners(self.problem, [to_numpy(box.lower), to_numpy(box.upper), x], self.control)
 
     def go_on(self, x: np.ndarray, u: np.ndarray) -> None:
         """Append the state x (n,) after the control u (m,)."""
@@ -69,7 +69,7 @@ class Picture:
     def _plane(self, panel: Axes) -> None:
         box, axes = self.problem.initial_states, plane_axes(self.problem)
         path = np.array(self.path)
-        set_plane(panel, self.problem, axes, np.stack([*path, numpy_of(box.lower), numpy_of(box.upper)]))
+        set_plane(panel, self.problem, axes, np.stack([*path, to_numpy(box.lower), to_numpy(box.upper)]))
         panel.plot(*path[:, axes].T, color=BLUE, linewidth=1.0)
         panel.plot(*path[-1, axes], "o", color=BLUE, markersize=5)
 
@@ -89,8 +89,8 @@ class Picture:
 
 def set_stage(panel: Axes, problem: Problem, corners: np.ndarray) -> None:
     """Set the view of a panel in metres so that it contains the points (k, 2); draw the shapes of the goal in red."""
-    rest = numpy_of(problem.controls.moved(problem.goal, problem.rest))
-    goal = shapes_of(problem, numpy_of(problem.goal), rest) if problem.has_goal else []
+    rest = to_numpy(problem.controls.moved(problem.goal, problem.rest))
+    goal = shapes_of(problem, to_numpy(problem.goal), rest) if problem.has_goal else []
     corners = np.concatenate([corners, *map(corners_of, goal)])
     low, high = corners.min(0), corners.max(0)
     side = 1.1 * max(float((high - low).max()), 1e-9) / 2
@@ -119,7 +119,7 @@ def set_plane(panel: Axes, problem: Problem, axes: list[int], states: np.ndarray
     panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     panel.tick_params(labelsize=7)
     if problem.has_goal:
-        panel.plot(*numpy_of(problem.goal)[axes], "*", color=VERMILION, markersize=10)
+        panel.plot(*to_numpy(problem.goal)[axes], "*", color=VERMILION, markersize=10)
     return low, high
 
 

@@ -140,7 +140,7 @@ def measure_with_estimator(loops: EstimatedLoops, estimator: OutputFeedback) -> 
 
 
 def _on_plants(plants: RandomPlants | None, x0: State, seed: int) -> Tensor:
-    """(x₀, p) of random plants; x₀ where there are none."""
+    """(x₀, p) of random plants; x₀ without random plants."""
     return x0 if plants is None else plants.draw(x0, stream(seed, PLANTS, TEST))
 
 

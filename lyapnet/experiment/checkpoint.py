@@ -25,7 +25,7 @@ ZOO = Path(__file__).parents[1] / "zoo"  # the controllers that come with lyapne
 DIGEST = "lyapnet_digest"  # key of digest_of(the other entries); since version 0.3
 
 
-def located(path: str | Path) -> Path:
+def locate_checkpoint(path: str | Path) -> Path:
     """The path of a checkpoint: the path itself, or the file of zoo:NAME, a controller that comes with lyapnet.
 
     Raises:
@@ -53,7 +53,7 @@ def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dic
         UsageError: no such file.
         CheckpointError: the file is truncated or damaged, no lyapnet checkpoint, or contains more than plain data.
     """
-    path = located(path)
+    path = locate_checkpoint(path)
     content = read_plain_data(path, device)
     if not isinstance(content, dict) or not all(isinstance(content.get(k), dict) for k in (KEY, "state_dict")):
         raise CheckpointError(

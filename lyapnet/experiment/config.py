@@ -503,7 +503,7 @@ def to_plain(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def abridged(config: Config) -> Config:
+def abridge_texts(config: Config) -> Config:
     """The config for tables and the text of loggers, with only the first lines of long texts."""
     texts = {key: getattr(config.system, key).splitlines() for key in TEXTS}
     shortened = {

@@ -10,7 +10,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file
 
 LARGEST_CSV = 10_000_000  # largest file, in bytes
-MOST_ROWS = 10_000
+MOST_ROWS = 10_000  # default limit of the number of rows
 
 
 def read_columns(

@@ -19,7 +19,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from lyapnet.base.errors import UsageError, did_you_mean, one_line
 from lyapnet.base.files import LARGEST_TEXT, read_file
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 
 _NUMBER = re.compile(r"\s*[-+]?[\d._]+(e[-+]?\d+)?\s*|.*\$\{.*", re.I)  # a number in quotes, or an interpolation
 
@@ -234,8 +234,10 @@ def _drop_replaced(content: Mapping[str, Any], later: Mapping[str, Any], schema:
         ):
             found.pop(f.name, None)
         elif isinstance(value, Mapping) and isinstance(other, Mapping):
-            replaced = {joined(name) for name in other}
-            found[f.name] = {name: one for name, one in value.items() if name in other or joined(name) not in replaced}
+            replaced = {with_underscores(name) for name in other}
+            found[f.name] = {
+                name: one for name, one in value.items() if name in other or with_underscores(name) not in replaced
+            }
     return found
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
-from lyapnet.base.cluster import connected
+from lyapnet.base.cluster import connect_to_cluster
 from lyapnet.base.errors import LyapnetError, UsageError, one_line
 from lyapnet.base.threads import use_threads
 from lyapnet.prover.boxes import Boxes
@@ -64,7 +64,7 @@ def workers_for_boxes(
         UsageError: a worker was killed, perhaps for lack of memory, or the cluster does not answer.
     """
     if ray is not None:
-        with connected(ray) as cluster, _cluster_map(cluster, make_question, workers) as run:
+        with connect_to_cluster(ray) as cluster, _cluster_map(cluster, make_question, workers) as run:
             yield partial(_find_undecided_in_parallel, run, question)
         return
     with _worker_pool(question, workers) as pool:

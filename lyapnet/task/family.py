@@ -33,7 +33,7 @@ GENERIC_CONTROL = 0.3  # each control at which dynamics that are not affine are 
 MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
 ROUNDING = 1e-14  # coefficients of targets below this count as zero, relative to the largest state or control
 LOGARITHM = "log10 "  # begins the names of states that are logarithms of weights
-PREFIX = "target_"  # of parameters that move the target instead of the dynamics
+PREFIX = "target_"  # prefix of names of parameters that move the target instead of the dynamics
 
 
 class FamilySystem(ExtendedSystem):

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lyapnet.base.contracts import called
+from lyapnet.base.contracts import call_checked
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Noise as NoiseMatrix
@@ -88,7 +88,7 @@ class SystemNoise(Noise):
         super().__init__()
         self.system = system
         name, noise = f"{type(system).__name__}.noise(x)", system.noise
-        sigma: Any = called(name, noise, [like[None]])  # pyright: ignore[reportArgumentType]
+        sigma: Any = call_checked(name, noise, [like[None]])  # pyright: ignore[reportArgumentType]
         if not isinstance(sigma, Tensor) or not sigma.ndim or not sigma.shape[-1]:
             got = tuple(sigma.shape) if isinstance(sigma, Tensor) else type(sigma).__name__
             raise UsageError(

@@ -13,7 +13,7 @@ from lyapnet.base.linear_algebra import apply, multiply, solve
 from lyapnet.base.types import Control, ControlMatrix, State
 from lyapnet.task.sets import ControlSet, finite_numbers, passed_through
 
-MOST_CONTROLS = 4
+MOST_CONTROLS = 4  # largest number of controls
 MOST_COMBINATIONS = 2000  # largest number of sets of rows; each takes a linear system for each state
 INWARDS = 16  # units of rounding by which controls are moved inside, relative to the sum of sizes of a row's terms
 LEAST_WIDTH = 1e-4  # least radius of the largest ball in U, relative to U's size: far above rounding in float32

@@ -496,7 +496,7 @@ class Problem(nn.Module):
         return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
 
     def _recorded_dynamics(self, x: State) -> dict[str, Tensor]:
-        """f and g at some states; or ẋ under the control at rest, and under others beside it."""
+        """f and g at some states; or ẋ under the control at rest and under neighbouring controls."""
         if self.system.affine:
             return {"f": self.system.f(x), "g": self.system.g(x)}
         rest = self.nominal_at(x)

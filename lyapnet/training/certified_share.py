@@ -21,7 +21,6 @@ class CertifiedShare(Recurring):
         every: steps between bounds; the last validation always has one.
         states: number of states drawn for each bound.
         confidence: confidence of each bound.
-        confidence: of each.
     """
 
     def __init__(self, every: int, states: int, confidence: float):

@@ -65,7 +65,7 @@ class Checkpoints(Checkpoint):
         self._install_handlers()  # before the first validation and figures, which take seconds
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._install_handlers()  # again: Lightning has replaced that of SIGTERM
+        self._install_handlers()  # again, because Lightning has replaced the handler of SIGTERM
         if trainer.global_step == 0:  # the initial V may remain the best one
             self._save_best(trainer, pl_module)
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from lyapnet.experiment.config import Config, OutputsConfig
 
-OUTPUTS, OBSERVABLE = "outputs", "observable"  # facts of a task with outputs: what is measured, what that tells
+OUTPUTS, OBSERVABLE = "outputs", "observable"  # names of facts: the outputs, and whether they determine the state
 
 
 class Fact(NamedTuple):
@@ -29,7 +29,7 @@ def facts_of_config(config: Config) -> list[Fact]:
 
 
 def _outputs_facts(outputs: OutputsConfig) -> list[Fact]:
-    """What is measured, if that is not the state."""
+    """The outputs, if the config has some."""
     if outputs.noise is None:
         return []
     noise = outputs.noise * len(outputs.measure) if len(outputs.noise) == 1 else outputs.noise
@@ -40,7 +40,7 @@ def _outputs_facts(outputs: OutputsConfig) -> list[Fact]:
 
 
 def between(lower: Sequence[float], upper: Sequence[float]) -> str:
-    """Describe a box; one number on both sides is that of each state."""
+    """Describe a box; a single number on both sides holds for each state."""
     if len(lower) == len(upper) == 1:
         return f"each state between {lower[0]:.3g} and {upper[0]:.3g}"
     return f"between {format_numbers(lower)} and {format_numbers(upper)}"

@@ -6,7 +6,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from lyapnet.experiment.config import Config, abridged, to_plain, to_yaml
+from lyapnet.experiment.config import Config, abridge_texts, to_plain, to_yaml
 from lyapnet.training.curves import loggers_of_each, members_of
 
 # A panel for each measure with a chart for each curve: TensorBoard draws all curves of a run in one colour.
@@ -42,7 +42,7 @@ class Dashboard(Callback):
         for loggers, config in zip(loggers_of_each(trainer, pl_module), self.configs, strict=True):
             for logger in loggers:
                 if not isinstance(logger, TensorBoardLogger):
-                    logger.log_hyperparams(to_plain(abridged(config)))
+                    logger.log_hyperparams(to_plain(abridge_texts(config)))
                 elif trainer.global_step == 0:
                     logger.experiment.add_custom_scalars(layout(members_of(pl_module)[0].problem.has_goal))
-                    logger.experiment.add_text("config", textwrap.indent(to_yaml(abridged(config)), "    "))
+                    logger.experiment.add_text("config", textwrap.indent(to_yaml(abridge_texts(config)), "    "))

@@ -28,7 +28,7 @@ from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.limit_facts import limit_facts
 from lyapnet.training.loggers import drop_logs_after, log_result, without_writer_tracebacks
 from lyapnet.training.penalty_weight import find_penalty_weight
-from lyapnet.training.plan import Plan, plan_run, under_policy
+from lyapnet.training.plan import Plan, plan_run, with_policy
 from lyapnet.training.recovery import Returns
 from lyapnet.training.runs import CONFIG, EVALUATION, TrainingRun
 from lyapnet.training.stage_messages import PATIENCE, StageMessages, silent
@@ -203,7 +203,7 @@ def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | N
 
 def _switch_to_lookahead(plan: Plan, console: Console, is_first_process: bool) -> Plan:
     """The plan with the lookahead law, which is also written into the config of the run's folder."""
-    plan = under_policy(plan, "lookahead")
+    plan = with_policy(plan, "lookahead")
     if is_first_process:
         write_atomically(plan.run.folder / CONFIG, to_yaml(plan.config).encode())
         console.print(
@@ -245,12 +245,12 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
             report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
             results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
             log_result(own, one, results[-1], trainer.global_step)
-    result = results[0] if config.seeds == 1 else over_seeds(results)
+    result = results[0] if config.seeds == 1 else summarise_seeds(results)
     write_json(plan.run.folder / EVALUATION, result)
     return result
 
 
-def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def summarise_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The evaluations of several seeds, with mean and standard deviation of each measure that all seeds have."""
     measures = [key for key in results[0] if all(isinstance(result[key], float) for result in results)]
     columns = {key: [result[key] for result in results] for key in measures}

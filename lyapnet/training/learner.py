@@ -22,8 +22,8 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Path, in_float64, path_of, path_under
 from lyapnet.value.policy import LookaheadPolicy
 
-MIN_SAMPLE_SIZE = 0.5  # share of a batch that has to count in a cost with risk
-MOST_HALVINGS = 64  # of a risk, until so many count
+MIN_SAMPLE_SIZE = 0.5  # least effective sample size in a cost with risk, as a share of the batch
+MOST_HALVINGS = 64  # largest number of halvings of a risk until that size is reached
 
 
 class Learner(nn.Module):
@@ -169,14 +169,14 @@ class Learner(nn.Module):
     def _weights(self, trajectory: Trajectory) -> PerState:
         """The weights of closed loops in the mean cost with a risk θ, with a mean of one.
 
-        The derivative of (1/θ) log E exp(θJ) from x₀ is the mean of that of J with the weights exp(θJ) over its mean.
+        The derivative of (1/θ) log E exp(θJ) from x₀ is the mean of the derivatives of J with weights proportional to
+        exp(θJ).
         Under noise they are exp(θ Σ D_n), see Trajectory.compensated. On random plants, of which each x₀ has one, they
-        are exp(θ (J − V(0, x₀))), with V of the model: the dearest pairs of state and plant count most.
+        are exp(θ (J − V(0, x₀))), with V of the model: the most expensive pairs of state and plant count most.
 
-        With a strong risk a few of the weights are all that counts, and the derivative is a matter of chance. With an
-        effective sample size (Σw)²/Σw² below MIN_SAMPLE_SIZE of the batch all weights are zero under noise: V then
-        learns from its residuals alone, which hold on every path. On random plants θ is halved until it is large
-        enough.
+        With a large θ a few weights dominate, and the derivative is random. If the effective sample size (Σw)²/Σw² is
+        below MIN_SAMPLE_SIZE of the batch, all weights are zero under noise: V then learns from its residuals alone,
+        which hold on every path. On random plants θ is halved until the sample size is large enough.
         """
         risk = self.problem.risk
         if isinstance(trajectory, NoisyTrajectory) and trajectory.surprise is not None:
@@ -196,7 +196,7 @@ class Learner(nn.Module):
     def _spread_of_optima(self, cost: PerState) -> Tensor | None:
         """The spread of the optima, which makes losses of different steps comparable; None for a task with a goal.
 
-        Where no optimum is known it is the spread of the costs.
+        If no optimum is known, it is the spread of the costs.
         """
         if self.problem.has_goal:
             return None

@@ -40,9 +40,9 @@ def limit_facts(problem: Problem) -> list[Fact]:
 
         d/dt lᵀδ = λ lᵀδ + lᵀF(x*, u*) + lᵀB(u − u*).
 
-    If the first two terms together are larger than the last one for every u ∈ U, lᵀδ grows for ever, and the difference
-    grows like e^{λt}. So it is necessary for the linear model that they are not larger. This is not sufficient, and the
-    nonlinear system may differ. Modes that grow by less than a factor e within T are left out.
+    If the first two terms together are larger than the last one for every u ∈ U, lᵀδ grows without bound, and the
+    difference grows like e^{λt}. For the linear model it is therefore necessary that they are not larger. This is not
+    sufficient, and the nonlinear system may differ. Modes that grow by less than a factor e within T are left out.
     """
     if not problem.controls.limited or not problem.has_goal or problem.follows_reference:
         return []

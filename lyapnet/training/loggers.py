@@ -11,7 +11,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from lyapnet.base.errors import UsageError
-from lyapnet.experiment.config import Config, abridged, to_plain
+from lyapnet.experiment.config import Config, abridge_texts, to_plain
 from lyapnet.training.metrics_file import METRICS, MetricsFile
 from lyapnet.training.runs import TrainingRun
 
@@ -82,7 +82,7 @@ def log_result(loggers: Sequence[Logger], config: Config, result: dict[str, Any]
     metrics = {f"hp/{key}": value for key, value in result.items() if isinstance(value, float)}
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
-            logger.log_hyperparams(to_plain(abridged(config)), metrics, step=step + 1)
+            logger.log_hyperparams(to_plain(abridge_texts(config)), metrics, step=step + 1)
         elif not isinstance(logger, MetricsFile):  # evaluation.json has these numbers
             logger.log_metrics(metrics, step + 1)
         logger.finalize("success")
@@ -96,7 +96,7 @@ def _tensorboard(config: Config, run: TrainingRun, resumed_at: int | None) -> Lo
     first = 0 if resumed_at is None else resumed_at + 1
     folder = run.folder
     logger = TensorBoardLogger(folder.parent, name="", version=folder.name, default_hp_metric=False, purge_step=first)
-    logger.hparams = to_plain(abridged(config))  # written to hparams.yaml by its first `save`
+    logger.hparams = to_plain(abridge_texts(config))  # written to hparams.yaml by its first `save`
     return logger
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from lightning.fabric.utilities import rank_zero_only
 from lightning.pytorch.loggers import Logger
 
-from lyapnet.base.files import appending, read_file, write_atomically
+from lyapnet.base.files import open_for_appending, read_file, write_atomically
 
 METRICS = "metrics.csv"
 STEP, WALL_TIME = "step", "wall_time"  # wall_time: seconds since the Epoch
@@ -60,7 +60,7 @@ class MetricsFile(Logger):
             _, rows = _read(self.path)
             _write(self.path, columns, [*rows, *self._pending])
         else:
-            with appending(self.path) as file:
+            with open_for_appending(self.path) as file:
                 _writer(file, columns).writerows(self._pending)
         self._pending.clear()
 

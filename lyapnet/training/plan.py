@@ -123,7 +123,7 @@ def plan_run(
         return plan
 
 
-def under_policy(plan: Plan, policy: str) -> Plan:
+def with_policy(plan: Plan, policy: str) -> Plan:
     """The same plan with another control law and the same V."""
     config = copy.deepcopy(plan.config)
     config.rollout.policy = policy

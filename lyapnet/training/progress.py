@@ -93,7 +93,9 @@ class TrainingProgress(ProgressBar):
         tables = [member.validation for member in members]
         if not self._named:
             self._named = True
-            self._console.print(about_means([table for table in tables if table is not None]), soft_wrap=True)
+            self._console.print(
+                describe_validation_states([table for table in tables if table is not None]), soft_wrap=True
+            )
         summaries = [table.summary() for table in tables if table is not None]
         measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
         shares = [float(member.region_share) for member in members if member.region_share is not None]
@@ -114,7 +116,7 @@ class TrainingProgress(ProgressBar):
         self._stages.__exit__()
 
 
-def about_means(tables: Sequence[StateTable]) -> str:
+def describe_validation_states(tables: Sequence[StateTable]) -> str:
     """Describe the states over which validations take means."""
     states = sum(len(table.cost) for table in tables)
     optima = [table.optimal_cost for table in tables if table.optimal_cost is not None]

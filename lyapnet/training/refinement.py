@@ -22,7 +22,7 @@ from lyapnet.training.experiment import train
 from lyapnet.training.runs import CONFIG, LAST, TrainingRun, runs_of
 
 POINTS_FILE = "points.csv"
-CALLBACKS_PREFIX = "callbacks="  # of an override that names callbacks
+CALLBACKS_PREFIX = "callbacks="  # prefix of an override that names callbacks
 Refinable = SoundCertificate | RegionCertificate
 POINTS_PER_ROUND = 256  # counterexamples added in each round, and the same number of undecided points
 

@@ -60,7 +60,7 @@ class ValidationOptimum(Callback):
         own = states.reshape(-1, *states.shape[-2:])
         states = torch.stack([each.with_plants(x0, VALIDATION) for each, x0 in zip(members, own, strict=True)])
         if first.problem.risk and first.problem.noise is not None:
-            return None  # of E J, which validation measures, the optimum with risk is none
+            return None  # validation measures E J, for which the optimum with risk is not the optimum
         try:
             oracle = oracle_of(first.problem_of_loops, first.rollout.method)
             compared = states[..., :COMPARED_STATES, :]

@@ -300,10 +300,10 @@ class _HeldStep:
 
 
 def known_law(problem: Problem, V: ValueFunction) -> type[ValuePolicy] | None:
-    """The control law that V is made for; None if it is unknown.
+    """The control law for which V was trained; None if it is unknown.
 
-    It is `made_for`, if set. Otherwise a V with a model of its curvature is made for a law that holds u: the sampled
-    law, or the lookahead law with constraints.
+    It is `made_for`, if set. A V with a known curvature is otherwise for a law that holds u: the sampled law, or the
+    lookahead law with constraints.
     """
     if V.made_for is not None:
         if not issubclass(V.made_for, ValuePolicy):

@@ -8,7 +8,7 @@ import torch
 from lyapnet.base.files import read_json
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.loading import load
-from lyapnet.experiment.checkpoint import ZOO, located, zoo_names
+from lyapnet.experiment.checkpoint import ZOO, locate_checkpoint, zoo_names
 from lyapnet.loop.rollout import Trajectory
 
 
@@ -42,7 +42,7 @@ def entry(name: str) -> Entry:
     Raises:
         UsageError: there is none of that name.
     """
-    checkpoint = located(f"zoo:{name}")
+    checkpoint = locate_checkpoint(f"zoo:{name}")
     return Entry(name, checkpoint, read_json(ZOO / f"{name}.json", "install lyapnet again"))
 
 

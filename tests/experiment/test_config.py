@@ -16,7 +16,7 @@ from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import (
     MOST_LINES,
     Config,
-    abridged,
+    abridge_texts,
     config_from_plain,
     load_config,
     outline,
@@ -469,9 +469,9 @@ def test_equations_are_written_line_by_line(ending, plain):
 def test_loggers_have_the_first_lines_of_long_equations(plain):
     lines = [f"v{k} = x + {k}" for k in range(MOST_LINES + 5)]
     given = {**plain, "system": {"name": "equations", "equations": "\n".join(lines), "states": {"x": "m"}}}
-    shown = abridged(config_from_plain(given))
+    shown = abridge_texts(config_from_plain(given))
     assert shown.system.equations.splitlines() == [*lines[:MOST_LINES], "# and 5 further lines, in config.yaml"]
-    assert abridged(shown) == config_from_plain(to_plain(abridged(shown)))
+    assert abridge_texts(shown) == config_from_plain(to_plain(abridge_texts(shown)))
 
 
 def test_defaults_are_not_shared_between_configs(plain):

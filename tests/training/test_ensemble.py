@@ -24,7 +24,7 @@ from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.training import figure_logger
 from lyapnet.training.build import build_module
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.training.progress import about_means, mean_and_range
+from lyapnet.training.progress import describe_validation_states, mean_and_range
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import FCN, NETWORKS
 from tests.problems import problem_of
@@ -248,9 +248,12 @@ def test_a_measure_that_fewer_states_have_says_how_many():
 
     some, every = [1.0, 1.0, math.nan, math.nan], [1.0] * 4
     said = "below: means over 8 validation states, the same at every step"
-    assert about_means([table(every)] * 2) == said
-    assert about_means([table(some)] * 2) == f"{said}; cost/optimum over the 4 of them whose optimum is known"
-    assert "; regret over the 2 of them" in about_means([table(some, has_goal=False)])
+    assert describe_validation_states([table(every)] * 2) == said
+    assert (
+        describe_validation_states([table(some)] * 2)
+        == f"{said}; cost/optimum over the 4 of them whose optimum is known"
+    )
+    assert "; regret over the 2 of them" in describe_validation_states([table(some, has_goal=False)])
 
 
 # Interrupted, diverged, refused

@@ -13,7 +13,7 @@ import lyapnet
 from lyapnet import Controller
 from lyapnet.base.errors import UsageError
 from lyapnet.base.interpolation import Table
-from lyapnet.evaluation.after_horizon import in_plain_data, loops_after_horizon, share_at_goal
+from lyapnet.evaluation.after_horizon import loops_after_horizon, share_at_goal, to_plain_data
 from lyapnet.evaluation.after_horizon_figure import distances
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.experiment.assembly import Parts, build_problem, member
@@ -444,7 +444,7 @@ def test_what_each_law_after_the_end_does():
     assert list(found) == ["riccati", "receding", "hold"]
     for beyond, one in found.items():
         assert_close(one.distance, controller(beyond).rollout(X, steps=30).x.norm(dim=-1))
-    riccati, receding, hold = (row["distances"] for row in in_plain_data(list(found.values()), own, 3))
+    riccati, receding, hold = (row["distances"] for row in to_plain_data(list(found.values()), own, 3))
     assert [at["time"] for at in hold] == pytest.approx([1.0, 1.2, 2.0, 3.0])
     assert hold[0]["mean"] == receding[0]["mean"] == riccati[0]["mean"]
     assert len({at[-1]["mean"] for at in (hold, receding, riccati)}) == 3
@@ -473,7 +473,7 @@ def test_a_law_that_leaves_the_finite_numbers_says_so():
     assert "the closed loop diverges" in hold.refused
     assert float(receding.distance[-1].max()) < 1e-6
     assert float(riccati.distance[-1].max()) < 1e-6
-    assert in_plain_data(found, own, 40)[-1]["distances"][-1]["mean"] is None
+    assert to_plain_data(found, own, 40)[-1]["distances"][-1]["mean"] is None
     assert "none of hold" in distances(found, own).axes[0].get_title()
 
 

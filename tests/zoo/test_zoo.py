@@ -16,7 +16,7 @@ from lyapnet.cli import main
 from lyapnet.experiment.checkpoint import (
     KEY,
     ZOO,
-    located,
+    locate_checkpoint,
     note_in_checkpoint,
     read_checkpoint,
     write_checkpoint,
@@ -66,7 +66,7 @@ def test_a_controller_is_of_its_command_and_names_no_folder(name):
     for part in ("system", "cost", "controls", "initial_states", "horizon", "program"):
         assert vars(config_of(name))[part] == getattr(config, part)
     assert set(content) == {"state_dict", "global_step", KEY}
-    assert located(f"zoo:{name}").stat().st_size < 400_000
+    assert locate_checkpoint(f"zoo:{name}").stat().st_size < 400_000
 
 
 def test_a_worse_controller_is_told_from_its_record(tmp_path):
@@ -80,18 +80,18 @@ def test_a_worse_controller_is_told_from_its_record(tmp_path):
 
 
 def test_names():
-    assert located(f"zoo:{ONE}") == ZOO / f"{ONE}.ckpt"
-    assert located("logs/best.ckpt") == Path("logs/best.ckpt")
+    assert locate_checkpoint(f"zoo:{ONE}") == ZOO / f"{ONE}.ckpt"
+    assert locate_checkpoint("logs/best.ckpt") == Path("logs/best.ckpt")
     with pytest.raises(UsageError, match=f"one of .*{ONE}"):
-        located("zoo:nothing")
+        locate_checkpoint("zoo:nothing")
     with pytest.raises(UsageError, match="zoo:NAME"):
-        located("zoo:../zoo/" + ONE)
+        locate_checkpoint("zoo:../zoo/" + ONE)
 
 
 def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path(f"zoo:{ONE}").touch()
-    assert located(f"zoo:{ONE}") == Path(f"zoo:{ONE}")
+    assert locate_checkpoint(f"zoo:{ONE}") == Path(f"zoo:{ONE}")
 
 
 def test_the_wheel_holds_them():
@@ -137,7 +137,7 @@ def test_what_follows_the_end_is_as_the_record_and_the_page_have_it(monkeypatch,
 def test_what_follows_the_end_is_found_again(tmp_path, monkeypatch):
     """Not taken from the checkpoint; and what is recorded is of other closed loops than those of the choice."""
     path = tmp_path / "one.ckpt"
-    shutil.copy(located(f"zoo:{ONE}"), path)
+    shutil.copy(locate_checkpoint(f"zoo:{ONE}"), path)
     note_in_checkpoint(path, after_horizon={"beyond": "receding", "held": 3, "loops": 64, "reason": ""})
     monkeypatch.setattr(making, "is_held", lambda problem, x: torch.arange(x.shape[1]) < 5)
     recorded, noted = making.choose_law_after(path), read_checkpoint(path)[KEY]["after_horizon"]
@@ -176,7 +176,7 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     monkeypatch.setattr(making, "certify", lambda *_: certificate)
     trained = tmp_path / "run" / "checkpoints" / "best.ckpt"
     trained.parent.mkdir(parents=True)
-    shutil.copy(located(f"zoo:{ONE}"), trained)
+    shutil.copy(locate_checkpoint(f"zoo:{ONE}"), trained)
     known = dict.fromkeys(making.PACKAGES, "1") | {"commit": "abc", "seed": 0}
     (tmp_path / "run" / "run.json").write_text(json.dumps(known))
     record = making.make(ONE, trained, tmp_path / "zoo")

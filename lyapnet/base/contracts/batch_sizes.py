@@ -153,7 +153,7 @@ def _traced(function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Ten
         )
         example = torch.empty(HINT, *shape, dtype=argument.dtype)
         batches.append(mode.from_tensor(example, symbolic_context=context, source=ConstantSource(f"argument_{i}")))
-    traced = make_fx(  # of a lambda: make_fx would count self
+    traced = make_fx(  # a lambda, because make_fx would count self as an argument
         lambda *each: function(*each),
         tracing_mode="fake", _allow_non_fake_inputs=True, _disable_torch_fn_metadata_mode=True,
     )  # fmt: skip

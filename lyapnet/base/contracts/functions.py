@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.contracts.derivatives import at_state, check_derivative
 from lyapnet.base.contracts.memory import reaches_own_code
-from lyapnet.base.errors import UsageError, raised
+from lyapnet.base.errors import UsageError, describe_error
 
 REMEDIES = {  # text in an error of torch ↦ what to do
     "before Module.__init__() call": "call super().__init__() first in __init__",
@@ -78,7 +78,7 @@ def check_function(
         check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
     _check_independence(name, function, arguments, value)
     if differentiable:
-        check_derivative(name, lambda *batches: called(name, function, batches), arguments)
+        check_derivative(name, lambda *batches: call_checked(name, function, batches), arguments)
 
 
 def check_result(
@@ -99,7 +99,7 @@ def check_result(
     Raises:
         UsageError: the function fails, or its result has another type, shape or dtype.
     """
-    value = called(name, function, arguments)
+    value = call_checked(name, function, arguments)
     batch, dtype = len(arguments[0]), dtype or arguments[0].dtype
     got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
     if got != ((batch, *shape), dtype):
@@ -113,14 +113,14 @@ def check_result(
     return value
 
 
-def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
+def call_checked(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
     """Call a user's function; converts any error, also sys.exit(), to a UsageError of one line."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
         shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
         raise UsageError(
-            f"Expected {name} for arguments of shape {shapes}, got {raised(error)}; {remedy(error)}."
+            f"Expected {name} for arguments of shape {shapes}, got {describe_error(error)}; {remedy(error)}."
         ) from error
 
 
@@ -129,7 +129,7 @@ def remedy(error: BaseException) -> str:
     return next((advice for words, advice in REMEDIES.items() if words in str(error)), "correct it there")
 
 
-def initialised(part: Any) -> Any:
+def require_initialised(part: Any) -> Any:
     """Check that the __init__ of a part of a problem has called super().__init__(), and return the part.
 
     Raises:
@@ -152,17 +152,17 @@ def copied(module: nn.Module) -> Any:
         return copy.deepcopy(module).double().cpu()
     except Exception as error:
         raise UsageError(
-            f"Expected a {type(module).__name__} that can be copied, got {raised(error)}; call what it holds there by "
-            "its global name."
+            f"Expected a {type(module).__name__} that can be copied, got {describe_error(error)}; call what it "
+            "holds there by its global name."
         ) from error
 
 
 def _check_independence(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
     """Raise UsageError if results depend on other states of a batch, on its shape, or on random numbers."""
     tolerance = torch.finfo(value.dtype).eps ** 0.5
-    folded = called(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
-    first = called(name, function, [argument[:1] for argument in arguments])
-    alone = [called(name, function, [argument[i] for argument in arguments]) for i in range(3)]
+    folded = call_checked(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
+    first = call_checked(name, function, [argument[:1] for argument in arguments])
+    alone = [call_checked(name, function, [argument[i] for argument in arguments]) for i in range(3)]
     batches = (folded, value.reshape(2, -1, *value.shape[1:])), (first, value[:1])
     for some, expected in (*batches, *zip(alone, value[:3], strict=True)):
         if (

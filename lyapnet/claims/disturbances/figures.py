@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from lyapnet.base.drawing import BLUE, GREEN, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, VERMILION, legend_below, to_numpy
 from lyapnet.base.types import State, Value
 from lyapnet.claims.region import ProvedRegion
 from lyapnet.task.sets import Box
@@ -77,8 +77,8 @@ def _draw_levels(
     states = goal.repeat(GRID, GRID, 1)
     states[..., i], states[..., j] = torch.meshgrid(*axes, indexing="ij")
     with torch.no_grad():
-        value = numpy_of(V(states.new_zeros(GRID, GRID), states)).T
-    x, y, handles = numpy_of(axes[0]), numpy_of(axes[1]), []
+        value = to_numpy(V(states.new_zeros(GRID, GRID), states)).T
+    x, y, handles = to_numpy(axes[0]), to_numpy(axes[1]), []
     colours = colormaps["viridis"](torch.linspace(0.0, 0.85, len(disturbances)).tolist())
     for w, claim, colour in zip(disturbances, claims, colours, strict=True):
         if claim.rho == -math.inf:

@@ -6,7 +6,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lyapnet.base.drawing import BLUE, GREEN, GREY, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, VERMILION, legend_below, to_numpy
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import PerState
 from lyapnet.claims.costs import Inside
@@ -52,11 +52,11 @@ def _draw_state(panel: Axes, claim: ProvedTube, k: int, trajectory: Any, i: int)
     if bool(low.isfinite().all()):
         edges = torch.linspace(0, claim.duration, len(low) + 1)
         panel.fill_between(
-            numpy_of(edges), numpy_of(torch.cat([low, low[-1:]])), numpy_of(torch.cat([high, high[-1:]])),
+            to_numpy(edges), to_numpy(torch.cat([low, low[-1:]])), to_numpy(torch.cat([high, high[-1:]])),
             step="post", color=BLUE, alpha=0.2, linewidth=0, label="proved: all closed loops from there",
         )  # fmt: skip
     x = trajectory.x[..., i]
-    lines = panel.plot(numpy_of(trajectory.t), numpy_of(x), color=GREY, linewidth=0.6)
+    lines = panel.plot(to_numpy(trajectory.t), to_numpy(x), color=GREY, linewidth=0.6)
     if lines:
         lines[0].set_label("some, simulated by steps of Δt")
 
@@ -69,14 +69,14 @@ def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tup
         return
     middle = (lowest + highest) / 2
     order = middle.argsort()
-    x, low, high = (numpy_of(y[order]) for y in (middle, lowest / middle, highest / middle))
+    x, low, high = (to_numpy(y[order]) for y in (middle, lowest / middle, highest / middle))
     panel.fill_between(x, low, high, color=BLUE, alpha=0.2, linewidth=0)
     panel.plot(x, high, color=BLUE, linewidth=1, label="proved: the closed loop costs at most, and at least")
     panel.plot(x, low, color=BLUE, linewidth=1)
     if least is not None:
         lowest, whose = least
         label = f"proved: {whose} costs at least"
-        panel.plot(x, numpy_of((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=label)
+        panel.plot(x, to_numpy((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=label)
     relevant = (middle > 0.1 * middle.mean()) & lowest.isfinite()  # relative bounds of small costs are always wide
     if bool(relevant.any()):
         bottom, top = (lowest / middle)[relevant].min(), (highest / middle)[relevant].max()
@@ -84,8 +84,8 @@ def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tup
     if optimum is not None:
         first = middle[: len(optimum)]
         panel.plot(
-            numpy_of(first),
-            numpy_of(optimum / first),
+            to_numpy(first),
+            to_numpy(optimum / first),
             ".",
             color=VERMILION,
             markersize=4,

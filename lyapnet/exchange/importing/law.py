@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from lyapnet.base.contracts import called, check_memory, copied, reaches_own_code
+from lyapnet.base.contracts import call_checked, check_memory, copied, reaches_own_code
 from lyapnet.base.contracts.batch_sizes import check_batch_sizes
 from lyapnet.base.errors import UsageError
 from lyapnet.base.random_streams import TEST, stream
@@ -150,7 +150,7 @@ def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
 
     def call(x: State) -> None:
         with torch.no_grad():
-            called(name, function, [x])
+            call_checked(name, function, [x])
 
     check_memory({name: function}, lambda: call(x), lambda: call(ends))
     if reaches_own_code(function):
@@ -160,7 +160,7 @@ def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
 def _require_size(name: str, function: nn.Module, goal: State, size: int) -> None:
     """Refuse a function that does not return `size` finite numbers at x*."""
     with torch.no_grad():
-        found = called(name, function, [goal[None]])
+        found = call_checked(name, function, [goal[None]])
     if not isinstance(found, Tensor) or found.numel() != size:
         got = f"{found.numel()}" if isinstance(found, Tensor) else type(found).__name__
         raise UsageError(

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from lyapnet.base.contracts import initialised, remedy
-from lyapnet.base.errors import LyapnetError, UsageError, did_you_mean, raised
+from lyapnet.base.contracts import remedy, require_initialised
+from lyapnet.base.errors import LyapnetError, UsageError, describe_error, did_you_mean
 from lyapnet.experiment.config import Config, SystemConfig
 from lyapnet.loop.programs import PROGRAMS, Program
 from lyapnet.task.constraints import CONSTRAINTS, Constraints
@@ -76,7 +76,7 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
         cls = getattr(module, class_name, None)
     except (Exception, SystemExit) as error:  # the module is the user's
         raise UsageError(
-            f"Expected {key} as module:Class, got {name!r} ({raised(error)}); correct the name, or the module."
+            f"Expected {key} as module:Class, got {name!r} ({describe_error(error)}); correct the name, or the module."
         ) from error
     if cls is None:
         classes = [known for known, value in vars(module).items() if isinstance(value, type)]
@@ -120,7 +120,7 @@ def instance_of(options: Any, part: str) -> Any:
     cls = class_of(options, part)
     check_parameters(cls, options.name, options.parameters, part)
     with float64_defaults(), section(f"{part}.parameters of {options.name}"):
-        return initialised(cls(**options.parameters))
+        return require_initialised(cls(**options.parameters))
 
 
 def check_parameters(cls: type, name: str, parameters: Mapping[str, Any], part: str) -> None:
@@ -150,7 +150,7 @@ def section(name: str):
     except (Exception, SystemExit) as error:
         if str(error).startswith("Expected "):  # raised by lyapnet
             raise UsageError(f"{name}: {error}") from error
-        raise UsageError(f"Expected {name} that can be built, got {raised(error)}; {remedy(error)}.") from error
+        raise UsageError(f"Expected {name} that can be built, got {describe_error(error)}; {remedy(error)}.") from error
 
 
 @contextmanager

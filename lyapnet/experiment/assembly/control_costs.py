@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.base.contracts import check_function, initialised
+from lyapnet.base.contracts import check_function, require_initialised
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import check_parameters, float64_defaults, resolve, section
 from lyapnet.experiment.config import CostConfig
@@ -36,7 +36,7 @@ def _control_cost(key: str, given: Any, m: int) -> ControlCost:
     parameters = {name: value for name, value in given.items() if name != "name"}
     check_parameters(cls, given["name"], parameters, key)
     with float64_defaults(), section(key):
-        cost = initialised(cls(**parameters))
+        cost = require_initialised(cls(**parameters))
     for name, numbers in cost.named_buffers():
         if numbers.numel() not in (1, m):
             raise UsageError(f"Expected one {name} of {key}, or {m} of them, got {numbers.numel()}; give one for each.")

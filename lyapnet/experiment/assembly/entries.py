@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.task.systems import ControlSystem
 
 Value = TypeVar("Value")
@@ -58,11 +58,11 @@ def index_of(name: str, key: str, system: ControlSystem) -> int:
 
 def index_among(name: str, key: str, names: Sequence[str], advice: str = "name states of the system.") -> int:
     """The index of a name among those of states or controls; see `index_of`."""
-    written = [joined(each) for each in names]
-    if joined(name) not in written:
+    written = [with_underscores(each) for each in names]
+    if with_underscores(name) not in written:
         hint = did_you_mean(name, names, advice)
         raise UsageError(f"Expected {key} among {', '.join(names)}, got {name!r}; {hint}")
-    return list(names).index(name) if name in names else written.index(joined(name))
+    return list(names).index(name) if name in names else written.index(with_underscores(name))
 
 
 def by_state(

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.base.types import ControlMatrix, State
 from lyapnet.experiment.assembly.classes import Parts, section
 from lyapnet.experiment.assembly.target_family import cost_and_targets, target_of_member
@@ -158,7 +158,7 @@ def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, lis
 
 def _find_target_parameters(names: Collection[str], system: ControlSystem) -> dict[int, int]:
     """Index of a state ↦ index of the parameter target_STATE that is its target."""
-    known = {PREFIX + joined(name): i for i, name in enumerate(system.state_names)}
+    known = {PREFIX + with_underscores(name): i for i, name in enumerate(system.state_names)}
     moved = dict[int, int]()
     for k, name in enumerate(names):
         if not name.startswith(PREFIX):

@@ -12,7 +12,7 @@ from lyapnet.task.family import with_constant_states
 
 
 def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
-    """The plants of `randomise`, with parameters that V and the law are not told; None if there are none.
+    """The plants of `randomise`, with random parameters that V and the law do not know; None if there are none.
 
     The cost stays that of the model, also where it depends on a parameter, as R: inverse_mass does.
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.base.contracts import copied, initialised
+from lyapnet.base.contracts import copied, require_initialised
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.types import State
 from lyapnet.experiment.assembly.classes import DTYPES, Parts, float64_defaults, instance_of, section
@@ -62,7 +62,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
     with float64_defaults():
         # float64 copies for the checks below; the caller's own parts keep their precision
         given = (parts.system, parts.cost, parts.controls, parts.constraints)
-        system, cost, controls, constraints = (copy.deepcopy(initialised(part)) for part in given)
+        system, cost, controls, constraints = (copy.deepcopy(require_initialised(part)) for part in given)
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         initial_states = build_initial_states(config.initial_states, system)
@@ -130,7 +130,7 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
     """
     parts = parts or Parts()
     with float64_defaults():
-        system, controls = (copy.deepcopy(initialised(part)) for part in (parts.system, parts.controls))
+        system, controls = (copy.deepcopy(require_initialised(part)) for part in (parts.system, parts.controls))
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         initial_states = build_initial_states(config.initial_states, system)

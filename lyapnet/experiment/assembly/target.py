@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.experiment.assembly.entries import by_state, repeated, require_length
 from lyapnet.experiment.config import Config, ConstraintsConfig
 from lyapnet.task.cost import Cost, TargetCost
@@ -190,9 +190,11 @@ def _not_admitted_error(system: ControlSystem, controls: ControlSet, u: Tensor) 
 def state_limits(config: ConstraintsConfig, system: ControlSystem) -> tuple[Tensor, Tensor]:
     """The state limits of a config, within which points are preferred; their names are checked elsewhere."""
     low, high = (
-        torch.tensor([float(named.get(joined(name), none)) for name in system.state_names], dtype=torch.float64)
+        torch.tensor(
+            [float(named.get(with_underscores(name), none)) for name in system.state_names], dtype=torch.float64
+        )
         for side, none in ((config.lower, -math.inf), (config.upper, math.inf))
-        for named in ({joined(name): limit for name, limit in side.items()},)
+        for named in ({with_underscores(name): limit for name, limit in side.items()},)
     )
     return low, high
 

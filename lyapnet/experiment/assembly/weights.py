@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.experiment.assembly.classes import section
 from lyapnet.experiment.assembly.entries import repeated, rows
 from lyapnet.experiment.config import CostConfig
@@ -54,7 +54,7 @@ def weights_of(system: ControlSystem) -> dict[str, Weight]:
     """The weights of a quadratic cost by name: Q_STATE, R_CONTROL and Q_T_STATE, with _ for spaces."""
     entries = {matrix: system.control_names if matrix == "R" else system.state_names for matrix in MATRICES}
     return {
-        f"{matrix}_{joined(entry)}": Weight(matrix, i)
+        f"{matrix}_{with_underscores(entry)}": Weight(matrix, i)
         for matrix, names in entries.items() for i, entry in enumerate(names)
     }  # fmt: skip
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from lyapnet.base.cluster import connected
+from lyapnet.base.cluster import connect_to_cluster
 from lyapnet.base.errors import one_line
 
 LOG = "job.log"
@@ -111,13 +111,13 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
     """Yield outcomes as jobs end, on a Ray cluster whose machines share this folder; a core for each job.
 
     Args:
-        address: where the cluster is, as of lyapnet.base.cluster.connected.
+        address: where the cluster is, as for lyapnet.base.cluster.connect_to_cluster.
         begun: called with each job that is handed over.
 
     Raises:
         UsageError: Ray is not installed, or there is no cluster at the address.
     """
-    with connected(address) as ray:
+    with connect_to_cluster(address) as ray:
         remote: Any = ray.remote(num_cpus=1, max_retries=0)(_run_in)
         waiting: dict[Any, J] = {}
         for job in jobs:

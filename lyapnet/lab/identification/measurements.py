@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.base.types import State
 from lyapnet.experiment.csv_columns import read_columns
 from lyapnet.lab.identification.units import factor, name_and_unit
@@ -105,15 +105,15 @@ def read_measurements(path: Path, system: ControlSystem) -> Measurements:
     columns = read_columns(path, MOST_ROWS, LARGEST_FILE, "begin with t, controls and states")
     outputs = readable(system)
     controls = dict(zip(system.control_names, system.control_units, strict=True))
-    wanted = {joined(name): (name, unit) for name, unit in {**outputs, **controls}.items()}
+    wanted = {with_underscores(name): (name, unit) for name, unit in {**outputs, **controls}.items()}
     wanted |= {name: ("t", "s") for name in TIMES if name not in wanted}
     found, unread = dict[str, np.ndarray](), list[str]()
     for heading, column in columns.items():
         written, unit = name_and_unit(heading)
-        if joined(written) not in wanted:
+        if with_underscores(written) not in wanted:
             unread.append(heading)
             continue
-        name, own = wanted[joined(written)]
+        name, own = wanted[with_underscores(written)]
         if name in found:
             raise UsageError(f"Expected {name} once in {str(path)!r}, got two columns; leave one of them out.")
         found[name] = np.array(column) * factor(unit, own, f"{name} of {str(path)!r}")

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 
 from lyapnet.base.errors import UsageError
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.experiment.assembly.classes import default_dtype
 from lyapnet.experiment.config import Config
 from lyapnet.lab.identification.identify import held_out_curves, split_recordings
@@ -98,7 +98,7 @@ class Network:
         prefix = "residual"
         while prefix in equations:
             prefix += "_"
-        names, count = [joined(name) for name in self.states], len(self.b)
+        names, count = [with_underscores(name) for name in self.states], len(self.b)
         slopes = self.w / self.width
         offsets = self.b - slopes @ self.center
         lines = list[str]()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lyapnet.base.errors import LyapnetError, UsageError
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 from lyapnet.experiment.assembly.entries import repeated
 from lyapnet.lab.identification.estimation import Fit, Point, Solution
 from lyapnet.lab.identification.measurements import Measurements
@@ -192,5 +192,5 @@ class Search:
                 or [f"reading {k + 1}" for k in range(len(outputs.noise))]
             )
         given = repeated(list(outputs.noise), len(names))
-        by_name = {joined(name): value for name, value in zip(names, given, strict=False)}
-        return np.array([by_name.get(joined(name), np.nan) for name in self.readings.names])
+        by_name = {with_underscores(name): value for name, value in zip(names, given, strict=False)}
+        return np.array([by_name.get(with_underscores(name), np.nan) for name in self.readings.names])

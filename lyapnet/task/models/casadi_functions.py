@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from lyapnet.base.errors import UsageError, one_line
-from lyapnet.base.names import joined
+from lyapnet.base.names import with_underscores
 
 POINTS = 8  # random points at which equations are compared with the function
 
@@ -194,7 +194,7 @@ def _names_of(function: Any, i: int, given: Sequence[str]) -> list[str]:
                 f"Expected {count} names for {name} of {function.name()}, got {len(given)} ({', '.join(given)}); name "
                 "each in its order."
             )
-        return [joined(each) for each in given]
+        return [with_underscores(each) for each in given]
     symbols = [str(each) for each in function.sx_in(i).elements()]
     usable = all(_is_name(each) for each in symbols) and len(set(symbols)) == count
     if usable and not all(each.startswith(f"i{i}") for each in symbols):  # the names that expand() gives

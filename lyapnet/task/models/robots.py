@@ -192,7 +192,7 @@ def _robot_of_urdf(text: str) -> Robot:
         _require_positive(link)
         for shown in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shown)
-    for element in [*root.findall("joint"), *root.iter("inertial")]:  # URDF's defaults, which adam asks for
+    for element in [*root.findall("joint"), *root.iter("inertial")]:  # adds URDF's defaults, which adam requires
         origin = element.find("origin")
         origin = ET.SubElement(element, "origin") if origin is None else origin
         for key in ("xyz", "rpy"):
@@ -218,7 +218,9 @@ def _robot_of_urdf(text: str) -> Robot:
         if effort > 0:
             actuators.append(Actuator(name, len(joints), -effort, effort))
         joints.append(Joint(name, kind == "prismatic", damping, friction))
-    for element in root.findall("joint"):  # the equations have no limits of q, and adam asks for all of their numbers
+    for element in root.findall(
+        "joint"
+    ):  # removes limits of q: the equations ignore them, and adam would require all of their numbers
         for read in element.findall("limit") + element.findall("dynamics"):
             element.remove(read)
     robot = Robot(ET.tostring(root, encoding="unicode"), joints, actuators, bodies=bodies)

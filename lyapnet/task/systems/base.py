@@ -144,7 +144,7 @@ class ControlSystem(nn.Module, ABC):
 
     @property
     def has_output(self) -> bool:
-        """Whether the system declares what is measured by a method `output(x)`."""
+        """Whether the system declares its readings by a method `output(x)`."""
         return callable(getattr(type(self), "output", None))
 
     @property

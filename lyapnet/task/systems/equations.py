@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.names import identifier, joined
+from lyapnet.base.names import identifier, with_underscores
 from lyapnet.base.shapes import Shape
 from lyapnet.base.types import Control, InputMatrix, State
 from lyapnet.task.systems.base import ControlSystem
@@ -40,7 +40,7 @@ class Definition(NamedTuple):
     @property
     def names(self) -> list[str]:
         """The names of states, controls and parameters, as equations write them."""
-        return [joined(name) for name in (*dict(self.states), *dict(self.controls), *self.parameters)]
+        return [with_underscores(name) for name in (*dict(self.states), *dict(self.controls), *self.parameters)]
 
 
 class EquationSystem(ControlSystem):
@@ -74,7 +74,7 @@ class EquationSystem(ControlSystem):
             setattr(self, self.attribute_of(name), parameters[name])
         lengths = self.formulas.names_at({"normal_force": 4, "friction_force": 3})
         self.contact_lengths: list[str] = [
-            self.attribute_of(name) for name in definition.parameters if joined(name) in lengths
+            self.attribute_of(name) for name in definition.parameters if with_underscores(name) in lengths
         ]
 
     @property
@@ -129,8 +129,8 @@ def system_class(definition: Definition) -> type[EquationSystem]:
     for kind, entries in (("states", definition.states), ("controls", definition.controls)):
         if not entries:
             raise UsageError(f"Expected system.{kind} as {{name: unit}} for the equations, got none; name them.")
-    results = [f"der({joined(name)})" for name, _ in definition.states]
-    controls = [joined(name) for name, _ in definition.controls]
+    results = [f"der({with_underscores(name)})" for name, _ in definition.states]
+    controls = [with_underscores(name) for name, _ in definition.controls]
     own = {
         "definition": definition, "__doc__": EquationSystem.__doc__,
         "formulas": Formulas(definition.equations, definition.names, results, controls),

@@ -20,7 +20,7 @@ from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.files import LARGEST_TEXT
 from lyapnet.task.systems.contact import Number, friction_force, normal_force
 
-MOST_OPERATIONS = 100_000
+MOST_OPERATIONS = 100_000  # largest number of operations of a text
 
 
 class Operation(NamedTuple):

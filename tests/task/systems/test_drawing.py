@@ -6,7 +6,7 @@ import yaml
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.shapes import Line, corners_of
-from lyapnet.experiment.config import MOST_LINES, abridged, config_from_plain, to_yaml
+from lyapnet.experiment.config import MOST_LINES, abridge_texts, config_from_plain, to_yaml
 from lyapnet.task.systems import Cartpole
 from lyapnet.task.systems.equations import defined
 
@@ -84,6 +84,6 @@ def test_loggers_have_the_first_lines():
     drawing = "\n".join(f"disk(0, 0, {k})" for k in range(MOST_LINES + 3))
     system = {"name": "equations", "equations": EQUATIONS, "drawing": drawing, "states": STATES,
               "controls": {"force": "N"}, "parameters": {"length": 0.8}}  # fmt: skip
-    shown = abridged(config_from_plain({**TASK, "system": system})).system
+    shown = abridge_texts(config_from_plain({**TASK, "system": system})).system
     assert shown.drawing.splitlines()[MOST_LINES:] == ["# and 3 further lines, in config.yaml"]
     assert shown.equations == EQUATIONS

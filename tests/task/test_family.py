@@ -223,7 +223,7 @@ def test_a_policy_asked_outside_its_family_says_so_once(trained, caplog):
     for _ in range(2):
         controller.policy(0, [0.0, 0.0], mass=0.8, length=1.6)
     (record,) = caplog.records
-    assert "length in [0.9, 1.5], and is asked outside" in record.getMessage()
+    assert "length in [0.9, 1.5] and is evaluated outside" in record.getMessage()
 
 
 @pytest.mark.gate

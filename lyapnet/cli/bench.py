@@ -224,7 +224,7 @@ def optima(
     from lyapnet.lab.bench.tables import optima_table
 
     use_threads(1)
-    with stages_of("optima") as report:
+    with make_stages("optima") as report:
         cases = [load_case(name, overrides or []) for name in _items(task) or ["double_integrator"]]
         rows = [time_optima(case, compared, report) for case in cases]
         report.rest()

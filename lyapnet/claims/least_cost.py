@@ -1,4 +1,4 @@
-"""A lower bound of the optimal cost, proved by a V that falls at most at the rate ℓ under every control."""
+"""A lower bound of the optimal cost, proved by a V with V̇ ≥ −ℓ under every control."""
 
 import time
 from collections.abc import Callable

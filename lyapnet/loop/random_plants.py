@@ -1,4 +1,4 @@
-"""Closed loops on plants that differ from the model: with random parameters that the law does not know."""
+"""Closed loops on plants that differ from the model (`randomise`), by parameters that the law does not know."""
 
 import torch
 from jaxtyping import Float

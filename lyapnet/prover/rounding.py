@@ -1,4 +1,4 @@
-"""Rounding errors of another program, as an operator in graphs that does not change values but widens bounds.
+"""An operator that marks results which another program rounds: values stay, bounds get wider.
 
 A function in real numbers that describes another program marks each rounded result with mark_rounded. Its values and
 derivatives stay those of real numbers; its bounds (lyapnet.prover.bounds) hold for every choice of the marked errors.

@@ -1,4 +1,4 @@
-"""The choice of the control law after T, under which closed loops stay near the goal."""
+"""Chooses which of the laws in law_after_horizon controls after T, so that closed loops stay near the goal."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

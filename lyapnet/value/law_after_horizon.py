@@ -1,4 +1,4 @@
-"""Control laws and value functions that continue after T, where V was not trained."""
+"""The control laws and value functions that can continue after T, where V was not trained; see after_horizon."""
 
 import logging
 from collections.abc import Callable

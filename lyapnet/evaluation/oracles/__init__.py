@@ -1,4 +1,4 @@
-"""Oracles: optimal costs by methods without learning. Training uses them only for its initial V, on other states."""
+"""Oracles: optimal costs by methods without learning, for tests, tables and the optima from which a training starts."""
 
 import importlib.util
 

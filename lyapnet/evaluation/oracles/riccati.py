@@ -1,7 +1,7 @@
 """Exact solution of linear-quadratic tasks by Riccati equations in discrete and continuous time.
 
-A reference for tests and tables, never used in training. The small matrices are computed in float64 on the CPU, so that
-the reference does not share the rounding of a float32 run.
+The small matrices are computed in float64 on the CPU, so that this reference does not share the rounding of a float32
+run.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""V with the constraint penalty of one step."""
+"""V as a network plus the constraint penalty of one step, which is known."""
 
 from collections.abc import Sequence
 from typing import Any

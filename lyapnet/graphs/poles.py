@@ -36,6 +36,8 @@ class Poles:
         The zero of a denominator that changes its sign is found by bisection. A function with a guard at the zero, such
         as torch.where(x == 0, …), does not grow there, and has no pole.
         """
+        if not x.numel():  # without paths torch cannot map over them
+            return torch.zeros(x.shape[1:-1], dtype=torch.bool)
         flat = x.reshape(len(x), -1, x.shape[-1])
         signs = self._denominators_at(flat) > 0
         step, member = torch.nonzero((signs[1:] != signs[:-1]).any(-1), as_tuple=True)

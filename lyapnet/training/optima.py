@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.threads import seconds_of_work
-from lyapnet.base.types import Control, ControlPath, State
+from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 from lyapnet.evaluation.oracles import Optima, optimal_cost
 from lyapnet.task.problem import Problem
 from lyapnet.training.stage_messages import StageReport, silent
@@ -41,6 +41,11 @@ MIN_IMPROVED_SHARE = 0.25  # share of improved optima from which on the oracle s
 NEIGHBOURS = 4  # nearest states whose optima are tried as initial guesses
 NEIGHBOUR_ROUNDS = 3  # how often, at most
 NEIGHBOUR_IMPROVEMENT = 0.99  # cost ratio below which a neighbour's solution is used
+OTHER_WAY = (
+    0.05  # largest difference of two paths, relative to the ranges of the states, beyond which they are two ways
+)
+WAYS = 6  # nearest states whose ways are tried
+OTHER_WAY_IMPROVEMENT = 0.999  # cost ratio below which an optimum found on another way is used
 
 
 def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: StageReport = silent) -> Optimum:
@@ -50,7 +55,7 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
        or random controls if there is no expansion. The oracle, if there is one, solves some of these states too.
     2. The other states: the initial guesses are the laws of the nearest solved states.
     3. The result may be only a local minimum, but the least cost is continuous in x₀: therefore the solution from each
-       state is finally tried from the states around it.
+       state is finally tried from the states around it, and where that leads another way, searched from there.
 
     Each search stops after SEARCH_SECONDS with the best trajectories so far.
 
@@ -78,11 +83,11 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
         if oracle_controls is not None:
             paths.append(path_under(exact, lambda n, _: oracle_controls[n], others))
         u = cheapest(paths).u
-        optimum = _concatenate(
+        optimum = concatenate(
             optimum,
             optimal_trajectories(problem, others, u, progress=progress, seconds=SEARCH_SECONDS, softer_first=False),
         )
-    return _improve_from_neighbours(exact, optimum, report)
+    return _improve_by_other_ways(exact, _improve_from_neighbours(exact, optimum, report), report)
 
 
 def waves(problem: Problem, cost: float, count: int) -> list[Callable[[int, State], Control]]:
@@ -167,22 +172,64 @@ def _improve_from_neighbours(exact: Problem, optimum: Optimum, report: StageRepo
     return optimum
 
 
+def _improve_by_other_ways(exact: Problem, optimum: Optimum, report: StageReport) -> Optimum:
+    """Search on the ways of neighbours wherever they differ from the own one, and keep what is cheaper.
+
+    Beside a cliff of the least cost, as within tight limits of the controls, the law of a neighbour on a cheaper way
+    may cost many times as much, and only a search that begins with it tells that this way is cheaper from here too.
+    From there the way is passed on to further neighbours, until no optimum improves.
+    """
+    x0, until = optimum.path.x[0], seconds_of_work() + SEARCH_SECONDS
+    if len(x0) < 2:
+        return optimum
+    neighbours = nearest(x0, x0, itself=False, count=WAYS)
+    changed = torch.ones(len(x0), dtype=torch.bool)
+    while changed.any() and (seconds := until - seconds_of_work()) > 0:
+        report(f"optima on other ways within {SEARCH_SECONDS:.0f} s of work")
+        rows, controls = list[Tensor](), list[Tensor]()
+        for column in neighbours.unbind(1):
+            to_try = torch.nonzero(changed[column]).flatten()
+            path = _follow_optimum(exact, optimum, column[to_try], x0[to_try])
+            own, their = optimum.path.x[:, to_try], optimum.path.x[:, column[to_try]]
+            apart = _path_distance(optimum, path.x, own)
+            other = path.cost.isfinite() & (apart > OTHER_WAY) & (apart > _path_distance(optimum, own, their) / 2)
+            rows.append(to_try[other])
+            controls.append(path.u[:, other])
+        tried, changed = torch.cat(rows), torch.zeros_like(changed)
+        if not len(tried):
+            break
+        found = optimal_trajectories(exact, x0[tried], torch.cat(controls, 1), seconds=seconds, softer_first=False)
+        gain = optimum.path.cost[tried] - found.path.cost
+        better = gain > (1 - OTHER_WAY_IMPROVEMENT) * sizes(exact, optimum.path.cost)[tried]
+        best = {int(tried[k]): k for k in gain.argsort() if better[k]}  # of several for a state the last one stays
+        if best:
+            rows = torch.tensor([*best])
+            optimum, changed[rows] = _replace_rows(optimum, rows, found.member(torch.stack([*best.values()]))), True
+    return optimum
+
+
+def _path_distance(optimum: Optimum, x: StatePath, other: StatePath) -> PerState:
+    """The largest differences (b,) of paths (N + 1, b, n), relative to the ranges of the states along the optima."""
+    least, most = optimum.path.x.flatten(0, 1).aminmax(dim=0)
+    return ((x - other).abs() / (most - least).where(most > least, 1)).amax((0, 2))
+
+
 def _follow_optimum(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
     """The paths from some states, each under the local law of one of the optima."""
     return follow_expansions(exact, optimum.expansion.member(which), x0)
 
 
-def nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:
-    """The indices (b, k) of the k nearest states in `others`, with each component scaled by its range."""
+def nearest(x0: Tensor, others: Tensor, itself: bool = True, count: int = NEIGHBOURS) -> Tensor:
+    """The indices (b, k) of the nearest states in `others`, `count` if there are, with components scaled by ranges."""
     spread = others.amax(0) - others.amin(0)
     scale = spread.where(spread > 0, 1)
     distance = torch.cdist(x0 / scale, others / scale)
     if not itself:
         distance.fill_diagonal_(torch.inf)
-    return distance.argsort(1)[:, : min(NEIGHBOURS, len(others) - (not itself))]
+    return distance.argsort(1)[:, : min(count, len(others) - (not itself))]
 
 
-def _concatenate(one: Optimum, other: Optimum) -> Optimum:
+def concatenate(one: Optimum, other: Optimum) -> Optimum:
     """Concatenation of two batches of optima."""
     path = Path(
         torch.cat([one.path.x, other.path.x], 1),

@@ -42,6 +42,10 @@ def test_each_path_of_a_batch_is_asked_by_itself():
     assert poles.crossed(x).tolist() == [[True, False, True]]
 
 
+def test_no_path_crosses_none():
+    assert poles_of(lambda x: 1 / x, ONE).crossed(ACROSS[:, None][:, :0]).shape == (0,)
+
+
 def test_a_function_that_divides_by_no_state_has_none():
     assert poles_of(lambda x: (x / 3 + torch.log(x) + x**2,), ONE) is None
     assert poles_of(lambda x: (x / float(x),), ONE) is None  # refused by another check

@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.evaluation.oracles import Optima
+from lyapnet.task.sets import ControlBox
 from lyapnet.task.systems import IntegratorChain, Linear
 from lyapnet.training import optima
 from lyapnet.training.optima import count_optima, optima_for
@@ -53,8 +54,9 @@ def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, w
     """And where that is so for many of the first, of the others too."""
     problem = hanging(steps=40)
     x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
-    monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
-    for name, value in (("BY_ORACLE", 3), ("MIN_IMPROVED_SHARE", many)):
+    for name, value in (
+        ("NEIGHBOUR_ROUNDS", 0), ("OTHER_WAY", math.inf), ("BY_ORACLE", 3), ("MIN_IMPROVED_SHARE", many),
+    ):  # fmt: skip
         monkeypatch.setattr(optima, name, value)
     good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
@@ -148,7 +150,20 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)
     begun.clear()
     monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
+    monkeypatch.setattr(optima, "OTHER_WAY", math.inf)
     assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
+
+
+@pytest.mark.gate
+def test_a_cheaper_way_is_found_where_the_law_of_the_neighbour_on_it_costs_more(monkeypatch, without_oracle):
+    """Within tight limits a neighbour's law just misses the last swing, until a search begins with it."""
+    problem = hanging(60, 0.06).replaced(controls=ControlBox([-3.0], [3.0]))
+    x0 = torch.stack([torch.linspace(2.5, 3.5, 24), torch.full((24,), 0.3)], 1)
+    cost = optima_for(problem, [riccati(problem)], x0).path.cost
+    monkeypatch.setattr(optima, "OTHER_WAY", math.inf)
+    without = optima_for(problem, [riccati(problem)], x0).path.cost
+    assert (cost <= (1 + 1e-9) * without).all()
+    assert float((cost / without).min()) < 0.9
 
 
 def test_one_state_and_states_that_share_a_coordinate(without_oracle):

@@ -41,9 +41,7 @@ MIN_IMPROVED_SHARE = 0.25  # share of improved optima from which on the oracle s
 NEIGHBOURS = 4  # nearest states whose optima are tried as initial guesses
 NEIGHBOUR_ROUNDS = 3  # how often, at most
 NEIGHBOUR_IMPROVEMENT = 0.99  # cost ratio below which a neighbour's solution is used
-OTHER_WAY = (
-    0.05  # largest difference of two paths, relative to the ranges of the states, beyond which they are two ways
-)
+OTHER_WAY = 0.05  # distance of two paths, relative to the ranges of the states, above which they are different ways
 WAYS = 6  # nearest states whose ways are tried
 OTHER_WAY_IMPROVEMENT = 0.999  # cost ratio below which an optimum found on another way is used
 
@@ -83,7 +81,7 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
         if oracle_controls is not None:
             paths.append(path_under(exact, lambda n, _: oracle_controls[n], others))
         u = cheapest(paths).u
-        optimum = concatenate(
+        optimum = _concatenate(
             optimum,
             optimal_trajectories(problem, others, u, progress=progress, seconds=SEARCH_SECONDS, softer_first=False),
         )
@@ -229,7 +227,7 @@ def nearest(x0: Tensor, others: Tensor, itself: bool = True, count: int = NEIGHB
     return distance.argsort(1)[:, : min(count, len(others) - (not itself))]
 
 
-def concatenate(one: Optimum, other: Optimum) -> Optimum:
+def _concatenate(one: Optimum, other: Optimum) -> Optimum:
     """Concatenation of two batches of optima."""
     path = Path(
         torch.cat([one.path.x, other.path.x], 1),

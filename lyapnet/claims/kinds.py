@@ -254,9 +254,9 @@ class Reach(Claim):
 class Region(ReadAtTimes):
     """A region of attraction of the receding law u(0, x), for all times: proved.
 
-    With a disturbance, and if it is `practical`, it is a set that no closed loop leaves, and a smaller set that each
-    closed loop enters and never leaves. With parameters, it holds for every plant whose constant parameters lie in the
-    given intervals.
+    With a disturbance or a held u, or if it is `practical`, it is a set that no closed loop leaves, and a smaller set
+    that each closed loop enters and never leaves. With parameters, it holds for every plant whose constant parameters
+    lie in the given intervals.
     Without `time` it is about steps if V was trained for these and no option is about continuous time; otherwise u is
     read at every t.
     lyapnet.claims.region.ProvedRegion states the conditions.

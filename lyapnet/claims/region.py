@@ -311,6 +311,8 @@ def prove_region(
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if problem.system.constants:
         raise UsageError("Expected one system, got a family; choose one member of it (option at).")
+    if steps and (disturbance is not None or readings is not None):
+        raise UsageError("Expected steps alone, got a disturbance or readings, of continuous time; leave one out.")
     n, names = problem.system.n, [] if plants is None else list(plants.nominal)
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
     w, loop = _nonzero_disturbance(disturbance, problem), copied(closed_loop).requires_grad_(False)

@@ -23,7 +23,7 @@ BOXES = 30_000  # largest number of boxes for the highest level at which V may r
 LEAST_SHARE = 0.003  # least share of D between two levels without samples at which V rises; less may be chance
 PIECES = 16  # number of boxes, about, into which the box of the constants is cut
 LEAST_LEVEL = 1e-6  # the smallest c under a disturbance or a held control, relative to the middle level
-LEAST_LEVEL_ALONE = 1e-3  # the same without these: V may fall everywhere, and a smaller c takes more boxes
+LEAST_LEVEL_UNDISTURBED = 1e-3  # the same without these: V may fall everywhere, and a smaller c takes more boxes
 
 
 def ultimate_level(
@@ -60,11 +60,11 @@ def ultimate_level(
         bounded = _PossibleRise(bounded_condition(condition, domain, level=level), middle)
     lower, upper = divide_box(*condition.search_box(domain), [1 + i for i in constants], PIECES)
     reached = value if condition.readings is not None else condition.level_reached
-    least = (LEAST_LEVEL_ALONE if condition.practical else LEAST_LEVEL) * middle
+    least = (LEAST_LEVEL_UNDISTURBED if condition.practical else LEAST_LEVEL) * middle
     highest = -minimum(
         lambda t, x: -reached(t, x).clamp_min(least), lower, upper, budget, possible, 0.0, bounded=bounded
     )
-    return min(middle, (1 + room) * highest)
+    return min(middle, max((1 + room) * highest, least))
 
 
 class _PossibleRise(Bounds):

@@ -4,6 +4,7 @@ import math
 import random
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,16 +12,17 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.base.errors import OracleError
-from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of, transcription
+from lyapnet.evaluation.oracles import Optima, Oracle, continuous_riccati, discrete_riccati, oracle_of, transcription
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, Candidate, MultiStart
+from lyapnet.evaluation.oracles.of_smoothed import OracleOfSmoothed
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import load_config
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.sets import Box, Unbounded
-from lyapnet.task.systems import Cartpole, DoubleIntegrator, Linear, Reacher
+from lyapnet.task.systems import Cartpole, ControlAffineSystem, DoubleIntegrator, Linear, Reacher
 from tests.marks import sample
 from tests.problems import problem_of
 
@@ -487,26 +489,81 @@ def test_an_optimum_that_no_controls_lead_along_is_confirmed_step_by_step():
     assert Transcription(calm).solve(x0).u.isfinite().all()
 
 
-def test_multipliers_are_the_slope_of_the_cost_to_go():
-    problem, x0 = pole_of_ten_seconds(), torch.tensor([1.0, -0.5])
-    oracle, riccati = Transcription(problem), discrete_riccati(problem.system, problem.cost, problem.horizon)
-    line = Candidate(np.linspace(x0.numpy(), 0, 201)[1:], np.zeros((200, 1)), math.inf)
-    found = oracle.minimise(x0.numpy(), line)
-    x = torch.from_numpy(found.x)[9].requires_grad_()
-    (slope,) = torch.autograd.grad(riccati.value(10, x), x)
-    assert_close(torch.from_numpy(found.multipliers)[9], slope, rtol=1e-4, atol=1e-6)
+def found_from(problem, x0):
+    """The oracle, and the minimum that IPOPT finds from a straight line."""
+    oracle, x0 = Transcription(problem), np.asarray(x0, dtype=float)
+    N, n, m = problem.horizon.steps, problem.system.n, problem.system.m
+    return oracle, oracle.minimise(x0, Candidate(np.linspace(x0, np.zeros(n), N + 1)[1:], np.zeros((N, m)), math.inf))
 
 
 def test_a_path_that_is_none_is_not_confirmed():
-    problem, x0 = pole_of_ten_seconds(), torch.tensor([1.0, -0.5])
-    oracle = Transcription(problem)
-    line = Candidate(np.linspace(x0.numpy(), 0, 201)[1:], np.zeros((200, 1)), math.inf)
-    found = oracle.minimise(x0.numpy(), line)
+    x0 = torch.tensor([1.0, -0.5])
+    oracle, found = found_from(pole_of_ten_seconds(), x0)
     assert oracle._cost_along(x0, found) == pytest.approx(found.cost, rel=1e-6)
     gap = found.x.copy()
-    gap[9] += 1e-3
-    for other in (
-        found._replace(x=gap), found._replace(cost=1.0001 * found.cost), found._replace(multipliers=None),
-        found._replace(x=np.full_like(found.x, np.nan)),
-    ):  # fmt: skip
+    gap[9] += 1e-2
+    for other in (found._replace(x=gap), found._replace(cost=1.0001 * found.cost)):
         assert oracle._cost_along(x0, other) is None
+
+
+class Logistic(ControlAffineSystem):
+    """ẏ = 4y(1 − y) − yu: y leaves 0 however little it is there."""
+
+    state_names, control_names = ("y",), ("u",)
+
+    def f(self, x):
+        return 4 * x * (1 - x)
+
+    def g(self, x):
+        return -x[..., None]
+
+
+class Unreachable(ControlAffineSystem):
+    """An unstable pole, and ż = 4z, which no control reaches."""
+
+    state_names, control_names = ("x", "v", "z"), ("u",)
+
+    def f(self, x):
+        return torch.stack([x[..., 1], 16 * x[..., 0], 4 * x[..., 2]], -1)
+
+    def g(self, x):
+        return x.new_tensor([[0.0], [1.0], [0.0]]).expand(*x.shape[:-1], 3, 1)
+
+
+@pytest.mark.parametrize(("system", "x0"), [(Logistic(), [1e-13]), (Unreachable(), [0.5, 0.0, 1e-9])], ids=["y", "z"])
+def test_what_grows_from_less_than_ipopts_tolerance_counts(system, x0):
+    """IPOPT's path may close such a gap for nothing, where a closed loop costs far more."""
+    n = system.n
+    cost = QuadraticCost(torch.eye(n), torch.eye(1), torch.eye(n))
+    problem = problem_of(system, cost, 200, 0.05, Box([-1.0] * n, [1.0] * n))
+    oracle, found = found_from(problem, x0)
+    along = None if isinstance(found, str) else oracle._cost_along(torch.tensor(x0), found)
+    optima = oracle.solve(torch.tensor([x0]))
+    least = 0.5 if n == 1 else 1e4  # of any closed loop, by far
+    assert along is None or along > least
+    assert optima.failures == 1 or float(optima.cost) > least
+
+
+def test_a_cheaper_rollout_is_no_confirmation_of_a_dearer_path(monkeypatch):
+    oracle, found = found_from(pole_of_ten_seconds(growth=0.1), [1.0, -0.5])
+    x0 = torch.tensor([[1.0, -0.5]])
+    monkeypatch.setattr(oracle, "_cost_along", lambda *_: 2 * found.cost)
+    search = SimpleNamespace(best=[found._replace(cost=2 * found.cost)], reasons=[""])
+    cost, reasons, _ = oracle._verify(x0, search, [None])
+    assert math.isnan(float(cost))
+    assert "in a rollout of its controls" in reasons[0]
+
+
+def test_without_controls_a_smoothed_optimum_is_unknown():
+    problem = pole_of_ten_seconds()
+
+    class Smoothed(Oracle):
+        def solve(self, x0, known, progress, seconds):
+            u = torch.zeros(200, 2, 1)
+            u[:, 1] = torch.nan
+            return Optima(torch.ones(2), ["", ""], u)
+
+    optima = OracleOfSmoothed(Smoothed(), problem, "euler").solve(torch.zeros(2, 2))
+    assert optima.failures == 1
+    assert optima.reasons[0] == ""
+    assert "no controls lead along" in optima.reasons[1]

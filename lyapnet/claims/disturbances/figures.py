@@ -50,7 +50,7 @@ def _draw_volumes(
     panel: Axes, disturbances: Sequence[float], claims: Sequence[ProvedRegion], labels: Sequence[str], disturbed: str
 ) -> None:
     volumes = [claim.volume for claim in claims]
-    ends = [claim.ultimate_volume if claim.disturbance is not None else 0.0 for claim in claims]  # nan is not drawn
+    ends = [claim.ultimate_volume if claim.is_practical else 0.0 for claim in claims]  # nan is not drawn
     style: dict[str, Any] = {"drawstyle": "steps-pre", "linewidth": 1}  # a claim about w covers smaller disturbances
     panel.plot(disturbances, volumes, "-", color=BLUE, **style, label="{V(0, x) ≤ ρ}, at least: not left")
     panel.plot(disturbances, ends, "s--", color=VERMILION, markersize=4, **style, label=ULTIMATE)
@@ -86,7 +86,7 @@ def _draw_levels(
         handles.append(Line2D([], [], color=colour, label=f"w_max = {w:g} {unit}"))
         if value.min() < claim.rho < value.max():
             panel.contour(x, y, value, levels=[claim.rho], colors=[colour], linewidths=1.4)
-        if claim.disturbance is not None and value.min() < claim.hole:
+        if claim.is_practical and value.min() < claim.hole:
             panel.contourf(x, y, value, levels=[value.min() - 1, claim.hole], colors=[colour], alpha=0.15)
             panel.contour(x, y, value, levels=[claim.hole], colors=[colour], linewidths=1.2, linestyles="--")
     panel.plot(*goal[[i, j]].tolist(), "*", color=GREEN, markersize=7)

@@ -5,8 +5,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
-
 from lyapnet.base.types import ControlPath, PerState, State
 
 Report = Callable[[int, int], None]  # called with (initial states done, total)
@@ -33,7 +31,7 @@ class Optima:
     @property
     def failures(self) -> int:
         """The number of states without optimum."""
-        return int(torch.isnan(self.cost).sum())
+        return int((~self.cost.isfinite()).sum())
 
 
 class Oracle(ABC):

@@ -29,6 +29,7 @@ class CasadiTask:
     Attributes:
         graphs: the torch traces of these functions.
         step, end, inside: the CasADi functions; ∫ℓ is without s(u), and inside is None without constraints.
+        slopes: (x_n, u_n) ↦ (∂x_{n+1}/∂x_n, ∂x_{n+1}/∂u_n), as CasADi function.
 
     Args:
         problem: in float64 on the CPU.
@@ -42,6 +43,7 @@ class CasadiTask:
         system = problem.system
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         self.step = self._translate(self.step_in_torch, (x, u))
+        self.slopes = _slopes_of(self.step)
         self.end = self._translate(self.end_in_torch, (x,))
         self.inside = None if problem.constraints is None else self._translate(self.inside_in_torch, (x,))
         self._excess = None if problem.controls.excess(u) is None else self._translate(self.excess_in_torch, (u,))
@@ -115,3 +117,10 @@ class CasadiTask:
         translated = casadi_function(self.graphs[-1], arguments)
         require_equal(translated, function, arguments)
         return translated
+
+
+def _slopes_of(step: casadi.Function) -> casadi.Function:
+    """(x, u) ↦ (∂x⁺/∂x, ∂x⁺/∂u) of a step (x, u) ↦ (x⁺, …)."""
+    x, u = step.mx_in()
+    following = step(x, u)[0]
+    return casadi.Function("slopes", [x, u], [casadi.jacobian(following, x), casadi.jacobian(following, u)])

@@ -25,7 +25,6 @@ class Candidate(NamedTuple):
     x: np.ndarray  # (N, n), from x₁ on
     u: np.ndarray  # (N, m)
     cost: float
-    multipliers: np.ndarray | None = None  # (N, n), ∂J/∂x⁺ of each step at a local minimum; None where not known
 
 
 def is_better(one: Candidate | None, other: Candidate | None) -> bool:

@@ -9,6 +9,8 @@ from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import in_float64, path_under
 
+NO_CONTROLS = "no controls lead along the optimum of the smoothed cost"
+
 
 class OracleOfSmoothed(Oracle):
     """The original cost of the controls that are optimal for the smoothed cost.
@@ -32,4 +34,7 @@ class OracleOfSmoothed(Oracle):
         assert optima.u is not None
         u = optima.u.double().cpu()
         cost = path_under(self.problem, lambda n, _: u[n], x0.detach().double().cpu()).cost.to(x0)
-        return Optima(cost.masked_fill(torch.isnan(optima.cost), torch.nan), optima.reasons, optima.u)
+        known = optima.cost.isfinite() & cost.isfinite()
+        pairs = zip(optima.reasons, known.tolist(), strict=True)
+        reasons = [reason or ("" if is_known else NO_CONTROLS) for reason, is_known in pairs]
+        return Optima(cost.masked_fill(~known, torch.nan), reasons, optima.u)

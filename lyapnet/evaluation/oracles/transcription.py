@@ -53,9 +53,9 @@ class Transcription(Oracle):
     trial path if none of these leads to a minimum. If all guesses lead to one minimum for each of the first states, the
     other states use only their neighbours' optima. The reported cost is that of a rollout in torch; the best controls
     are stored on disk. Where the system amplifies rounding so much that no controls lead along the minimum, as over a
-    long time near an unstable equilibrium, it is the cost of IPOPT's own path, if the torch steps confirm it, and the
-    controls are NaN. A state has NaN if no guess leads to a minimum or it is not confirmed. If all of the first few
-    states fail, the others are not tried. Known controls that violate a constraint are ignored.
+    long time near an unstable equilibrium, a closed loop that stays on IPOPT's path has to confirm it, and the controls
+    are NaN. A state has NaN if no guess leads to a minimum or it is not confirmed. If all of the first few states fail,
+    the others are not tried. Known controls that violate a constraint are ignored.
 
     Args:
         problem: the problem; it is copied to float64 on the CPU.
@@ -84,6 +84,7 @@ class Transcription(Oracle):
         self._iterations = iterations
         self._most_iterations = 0  # largest number of iterations of a first minimum; 0: none yet
         self._scales = Scales(self.problem)
+        self._slopes = self.task.slopes.map(horizon.steps)
         assert limits is not None  # checked by oracle_of
         free = torch.full((system.n,), torch.inf)
         ends = (-free, free) if domain is None else domain.narrowed(DOMAIN_MARGIN)
@@ -246,15 +247,12 @@ class Transcription(Oracle):
         u, x, _ = np.split(np.asarray(result["x"]).ravel(), [start.u.size, start.u.size + start.x.size])
         u = of_u * u.reshape(start.u.shape)
         u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # IPOPT may slightly violate U
-        multipliers = np.asarray(result["lam_g"]).ravel()[: start.x.size].reshape(start.x.shape)
-        return Candidate(
-            of_x * x.reshape(start.x.shape), u, scale * float(result["f"]), scale / of_x * multipliers
-        )  # fmt: skip
+        return Candidate(of_x * x.reshape(start.x.shape), u, scale * float(result["f"]))
 
     def _verify(
         self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]
     ) -> tuple[PerState, list[str], ControlPath]:
-        """(costs of the best controls in a rollout, or along IPOPT's paths, reasons why there is none, the controls).
+        """(costs of the best controls in a rollout, or of loops along IPOPT's paths, reasons for none, the controls).
 
         Costs are NaN if neither confirms them, and controls if a rollout does not.
         """
@@ -266,28 +264,43 @@ class Transcription(Oracle):
             reason = _reason_to_reject(best, candidate, given[i], search.reasons[i])
             if not reason and candidate is not None:
                 cost[i], u[:, i] = candidate.cost, torch.from_numpy(candidate.u)
-            elif best is not None and (along := self._cost_along(states[i], best)) is not None:
-                cost[i], reason = along, _reason_against(given[i], best._replace(cost=along))
-                cost[i] = math.nan if reason else along
+            elif best is not None and not (is_better(candidate, best) or is_better(given[i], best)):
+                along = self._cost_along(states[i], best)
+                if along is not None:
+                    cost[i], reason = along, ""
             reasons.append(reason)
         return cost, reasons, u
 
     def _cost_along(self, x0: State, minimum: Candidate) -> float | None:
-        """The cost of a minimum's own path, whose steps are taken one by one in torch; None if it is not confirmed.
+        """The cost of a closed loop that stays on a minimum's path; None if it differs from that of the minimum.
 
-        To first order the cost of a path that closes the gaps d_n = F(x_n, u_n) − x_{n+1} differs by Σ λ_{n+1}ᵀd_n,
-        with the multipliers λ. This must be as small as the difference that a rollout is allowed.
+        The control ū_n − K_n(x_n − x̄_n), projected onto U, holds an unstable system on the path (x̄, ū).
         """
-        if minimum.multipliers is None:
-            return None
-        x, u = torch.cat([x0[None], torch.from_numpy(minimum.x)]), torch.from_numpy(minimum.u)
+        u, K = torch.from_numpy(minimum.u), torch.from_numpy(self._gains_along(x0.numpy(), minimum))
+        path, nodes = torch.cat([x0[None], torch.from_numpy(minimum.x)]), [x0[None]]
+        J = torch.zeros(1, dtype=torch.float64)
         with torch.no_grad():
-            following, step_cost = self.problem.step(x[:-1], u)
-            cost = float(step_cost.sum() + self.problem.cost.terminal(x[-1]))
-            by_gaps = float((torch.from_numpy(minimum.multipliers) * (following - x[1:])).sum(-1).abs().sum())
-            admitted = bool(self._are_admitted(x[:, None]).all())
-        confirmed = max(by_gaps, abs(cost - minimum.cost)) <= _tolerance(minimum.cost)
-        return cost if admitted and confirmed else None
+            for k in range(len(u)):
+                control = self.problem.controls.project(u[k] - (K[k] @ (nodes[-1][0] - path[k])))
+                following, step_cost = self.problem.step(nodes[-1], control[None])
+                nodes, J = [*nodes, following], J + step_cost
+            cost = float(J + self.problem.cost.terminal(nodes[-1]))
+            admitted = bool(self._are_admitted(torch.stack(nodes)).all())
+        return cost if admitted and abs(cost - minimum.cost) <= _tolerance(minimum.cost) else None
+
+    def _gains_along(self, x0: np.ndarray, minimum: Candidate) -> np.ndarray:
+        """K (N, m, n) of linear-quadratic regulators with unit weights about a path, in units of the scales."""
+        of_x, of_u = self._scales.of_states, self._scales.of_controls
+        states = np.vstack([x0, minimum.x[:-1]])
+        slopes = self._slopes(states.T, minimum.u.T)
+        A, B = (np.asarray(part).T.reshape(len(states), -1, len(of_x)).swapaxes(1, 2) for part in slopes)
+        A, B = A * of_x / of_x[:, None], B * of_u / of_x[:, None]
+        P, gains = np.eye(len(of_x)), list[np.ndarray]()
+        for a, b in zip(A[::-1], B[::-1], strict=True):
+            K = np.linalg.solve(np.eye(len(of_u)) + b.T @ P @ b, b.T @ P @ a)
+            P = np.eye(len(of_x)) + a.T @ P @ (a - b @ K)
+            gains.append(K * of_u[:, None] / of_x)
+        return np.stack(gains[::-1])
 
 
 def _with_fallback(search: MultiStart, i: int, starts: Sequence[Candidate], last: Candidate) -> Iterator[Candidate]:

@@ -171,7 +171,7 @@ def dies_writing(name, call=1):
 def dies_appending(name, torn):
     """SIGKILL itself when only this much of what should be appended to a file of this name is written."""
     owner = pkgutil.resolve_name("lyapnet.training.metrics_file")
-    original = owner.appending
+    original = owner.open_for_appending
 
     @contextlib.contextmanager
     def deadly(path):
@@ -182,7 +182,7 @@ def dies_appending(name, torn):
                 os.kill(os.getpid(), signal.SIGKILL)
             yield file
 
-    owner.appending = deadly
+    owner.open_for_appending = deadly
 
 
 # What a run leaves behind

@@ -70,7 +70,7 @@ def same(one, other):
 def test_after_a_while_it_returns_to_its_best_weights(config, capsys, monkeypatch):
     seen = Validations(monkeypatch, [3, 2, 2.1, 2.1, 2.1, 1.9, 1.9])  # worse at 4, 6 and 8: for 4 steps
     run, out = run_of(config, capsys)
-    assert "worse: the validation states cost 2.1 at step 8, 2 at step 2; it goes on from there" in out
+    assert "worse: the validation states cost 2.1 at step 8, 2 at step 2; training continues from there" in out
     (entry,) = run.record()["returns"]
     assert entry == {"to": 2, "rate_share": 1 / RATE_DIVISOR, "because": "cost 2.1 at step 8, 2 at step 2"}
     calm = Validations(monkeypatch, [3, 2, 2.1, 2, 2.1, 1.9, 1.9])  # never worse for so long

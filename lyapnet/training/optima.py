@@ -43,6 +43,7 @@ NEIGHBOUR_ROUNDS = 3  # how often, at most
 NEIGHBOUR_IMPROVEMENT = 0.99  # cost ratio below which a neighbour's solution is used
 OTHER_WAY = 0.05  # distance of two paths, relative to the ranges of the states, above which they are different ways
 WAYS = 6  # nearest states whose ways are tried
+FIRST_WAYS = 96  # ways that are tried first; the others only if one of these is cheaper
 OTHER_WAY_IMPROVEMENT = 0.999  # cost ratio below which an optimum found on another way is used
 
 
@@ -175,13 +176,14 @@ def _improve_by_other_ways(exact: Problem, optimum: Optimum, report: StageReport
 
     Beside a cliff of the least cost, as within tight limits of the controls, the law of a neighbour on a cheaper way
     may cost many times as much, and only a search that begins with it tells that this way is cheaper from here too.
-    From there the way is passed on to further neighbours, until no optimum improves.
+    If one of FIRST_WAYS does so, all others are tried too, and what is found is passed on to further neighbours, until
+    no optimum improves.
     """
     x0, until = optimum.path.x[0], seconds_of_work() + SEARCH_SECONDS
     if len(x0) < 2:
         return optimum
     neighbours = nearest(x0, x0, itself=False, count=WAYS)
-    changed = torch.ones(len(x0), dtype=torch.bool)
+    changed, is_first = torch.ones(len(x0), dtype=torch.bool), True
     while changed.any() and (seconds := until - seconds_of_work()) > 0:
         report(f"optima on other ways within {SEARCH_SECONDS:.0f} s of work")
         rows, controls = list[Tensor](), list[Tensor]()
@@ -193,16 +195,21 @@ def _improve_by_other_ways(exact: Problem, optimum: Optimum, report: StageReport
             other = path.cost.isfinite() & (apart > OTHER_WAY) & (apart > _path_distance(optimum, own, their) / 2)
             rows.append(to_try[other])
             controls.append(path.u[:, other])
-        tried, changed = torch.cat(rows), torch.zeros_like(changed)
+        tried, u = torch.cat(rows), torch.cat(controls, 1)
         if not len(tried):
             break
-        found = optimal_trajectories(exact, x0[tried], torch.cat(controls, 1), seconds=seconds, softer_first=False)
+        if is_first:
+            every = max(1, len(tried) // FIRST_WAYS)
+            tried, u = tried[::every], u[:, ::every]
+        found = optimal_trajectories(exact, x0[tried], u, seconds=seconds, softer_first=False)
         gain = optimum.path.cost[tried] - found.path.cost
         better = gain > (1 - OTHER_WAY_IMPROVEMENT) * sizes(exact, optimum.path.cost)[tried]
         best = {int(tried[k]): k for k in gain.argsort() if better[k]}  # of several for a state the last one stays
-        if best:
-            rows = torch.tensor([*best])
-            optimum, changed[rows] = _replace_rows(optimum, rows, found.member(torch.stack([*best.values()]))), True
+        if not best:
+            break
+        changed, is_first = changed if is_first else torch.zeros_like(changed), False
+        rows = torch.tensor([*best])
+        optimum, changed[rows] = _replace_rows(optimum, rows, found.member(torch.stack([*best.values()]))), True
     return optimum
 
 

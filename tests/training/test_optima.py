@@ -154,6 +154,24 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
 
 
+def test_where_no_way_is_cheaper_few_are_tried(monkeypatch, without_oracle):
+    """Of 80 paths that count as different ways, every fifth is searched from."""
+    problem, batches = hanging(steps=20), []
+
+    def counted(problem, x0, *arguments, **options):
+        batches.append(len(x0))
+        return optimal_trajectories(problem, x0, *arguments, **options)
+
+    x0 = problem.initial_states.sample(20)
+    optimum = optimal_trajectories(problem, x0, torch.zeros(20, 20, 1))
+    for name, value in (("OTHER_WAY", -1.0), ("FIRST_WAYS", 16), ("optimal_trajectories", counted)):
+        monkeypatch.setattr(optima, name, value)
+    monkeypatch.setattr(optima, "_path_distance", lambda _, x, other: torch.ones(x.shape[1]))
+    monkeypatch.setattr(optima, "WAYS", 4)
+    assert optima._improve_by_other_ways(problem, optimum, optima.silent) is optimum
+    assert batches == [16]
+
+
 @pytest.mark.gate
 def test_a_cheaper_way_is_found_where_the_law_of_the_neighbour_on_it_costs_more(monkeypatch, without_oracle):
     """Within tight limits a neighbour's law just misses the last swing, until a search begins with it."""

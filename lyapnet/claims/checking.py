@@ -233,7 +233,7 @@ def _reprove_region(controller: Controller, path: Path, budget: Budget, report: 
     plants = plants_of(controller, kept.parameters) if kept.parameters else None
     claim = prove_region(
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
-        kept.disturbance, plants, kept.readings, kept.steps is not None, kept.practical,
+        kept.disturbance, plants, kept.readings, kept.steps is not None, kept.is_practical,
     )  # fmt: skip
     reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is above the level of the proof"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds

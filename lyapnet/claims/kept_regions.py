@@ -30,11 +30,15 @@ class KeptRegion(NamedTuple):
     disturbance: State | None  # w
     readings: Readings | None  # when u is read; None: at every t
     steps: dict[str, Any] | None  # Δt and method of the steps; None: continuous time
-    practical: bool  # whether practical stability is claimed without a disturbance and readings
     hole: float  # c
     wanted: float  # the level up to which the proof searched
     rho: float  # the proved level, as recorded
     seconds: float  # of the search
+
+    @property
+    def is_practical(self) -> bool:
+        """Whether the claim is practical stability."""
+        return self.contracting is None
 
     def require(
         self,
@@ -63,10 +67,10 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the readings of {str(self.path)!r}, got others; {NEW_FILE}.")
         if self.steps != steps:
             raise UsageError(f"Expected the steps of {str(self.path)!r}, or none, got others; {NEW_FILE}.")
-        if self.practical != practical:
+        if self.is_practical != practical:
             ends = ("convergence", "practical stability")
             raise UsageError(
-                f"Expected {ends[self.practical]} as in {str(self.path)!r}, got {ends[practical]}; {NEW_FILE}."
+                f"Expected {ends[self.is_practical]} as in {str(self.path)!r}, got {ends[practical]}; {NEW_FILE}."
             )
 
     def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
@@ -134,7 +138,7 @@ def kept_region(path: Path) -> KeptRegion:
         if steps is not None:
             steps = {"dt": float(steps["dt"]), "method": str(steps["method"])}
         return KeptRegion(
-            path, decay, D, ranges, contracting, w, readings, steps, practical, hole, wanted, rho, seconds
+            path, decay, D, ranges, contracting, w, readings, steps, hole, wanted, rho, seconds
         )  # fmt: skip
 
 

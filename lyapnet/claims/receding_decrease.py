@@ -30,7 +30,8 @@ class RecedingDecrease(DecreaseCondition):
     Args:
         parameters: names of the constants of the system, on which neither V nor u depends.
         readings: when u(0, x) is read and then held; None: it is read at every t.
-        practical: whether the hole is all of {V < c}, though there are no disturbance and no readings.
+        practical: whether the hole is all of {V < c}, and not a set on which the law contracts; always so with a
+            disturbance or readings.
     """
 
     proves, partial = "region", True
@@ -48,12 +49,8 @@ class RecedingDecrease(DecreaseCondition):
         if not 0 < decay < math.inf:
             raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
         self.decay, self.hole, self.around, self.parameter_names = decay, 0.0, None, list(parameters)
-        self.practical = practical
-
-    @property
-    def is_practical(self) -> bool:
-        """Whether the hole is all of {V < c}, and not a set on which the law contracts."""
-        return self.practical or self.disturbance is not None or self.readings is not None
+        self.is_undisturbed = disturbance is None and readings is None
+        self.is_practical = practical or not self.is_undisturbed
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -61,7 +58,7 @@ class RecedingDecrease(DecreaseCondition):
         hole = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
         disturbance = {} if w is None else {"disturbance": w.tolist()}
         parameters = {"parameters": self.parameter_names} if self.parameter_names else {}
-        practical = {"practical": True} if self.practical else {}
+        practical = {"practical": True} if self.is_practical and self.is_undisturbed else {}
         return {
             "decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters, **practical,
             **self.facts_of_readings,

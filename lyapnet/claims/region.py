@@ -126,12 +126,7 @@ class ProvedRegion:
     distance_left: float = math.nan  # a bound of the distance from the goal as t → ∞, if u is rounded
     readings: Readings | None = None  # when u is read; None: at every t
     steps: Horizon | None = None  # Δt and method of the steps; None: continuous time
-    practical: bool = False  # whether practical stability is claimed without a disturbance and readings
-
-    @property
-    def is_practical(self) -> bool:
-        """Whether the claim is practical stability: closed loops enter {V ≤ c}, and stay there."""
-        return self.practical or self.disturbance is not None or self.readings is not None
+    is_practical: bool = False  # whether it is practical stability: closed loops enter {V ≤ c}, and stay there
 
     @property
     def entered_within(self) -> float:
@@ -267,7 +262,7 @@ def _read_kept(file: Path | None, condition: RecedingDecrease, n: int) -> KeptRe
     kept = kept_region(file)
     kept.require(
         condition.decay, condition.disturbance, n, condition.parameter_names, condition.readings,
-        condition.facts.get("steps"), condition.practical,
+        condition.facts.get("steps"), condition.is_practical,
     )  # fmt: skip
     return kept
 
@@ -321,7 +316,6 @@ def prove_region(
         states, w = states and plants.around(states), None if w is None else plants.disturbance_of_all(w)
         readings = readings and plants.readings_of_all(readings)
     stepped = problem if steps else None
-    practical = practical and w is None and readings is None
     condition = (
         SteppedDecrease(loop, decay, problem, names, practical) if steps
         else RecedingDecrease(loop, decay, w, names, readings, practical)
@@ -358,7 +352,7 @@ def prove_region(
         disturbance=None if w is None else w[:n], extent=extent, ultimate_share=ultimate, plants=plants, set_up=set_up,
         precision=precision, distance_left=distance,
         readings=readings and replace(readings, errors=readings.errors[:n]), steps=problem.horizon if steps else None,
-        practical=practical,
+        is_practical=condition.is_practical,
     )  # fmt: skip
 
 

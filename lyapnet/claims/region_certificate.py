@@ -96,7 +96,7 @@ class RegionCertificate(Certificate):
             readings = readings and claim.plants.readings_of_all(readings)
         if claim.steps is not None:
             return *self._stepped(states), math.inf if claim.proof is None else claim.proof.wanted
-        condition = RecedingDecrease(loop, claim.decay, w, readings=readings, practical=claim.practical)
+        condition = RecedingDecrease(loop, claim.decay, w, readings=readings, practical=claim.is_practical)
         self._open_hole(condition)
         return condition, over_time(states, 0.0), claim.rim
 
@@ -111,7 +111,7 @@ class RegionCertificate(Certificate):
         problem, claim = copied(self.controller.problem), self.claim
         if claim.plants is not None:
             problem = claim.plants.problem(problem)
-        condition = SteppedDecrease(self._loop, claim.decay, problem, practical=claim.practical)
+        condition = SteppedDecrease(self._loop, claim.decay, problem, practical=claim.is_practical)
         condition.keep_within(states, [i for i in range(claim.states.dimension) if i not in claim.left_out])
         self._open_hole(condition)
         return condition, over_time(states, 0.0)

@@ -60,7 +60,7 @@ def ultimate_level(
         bounded = _PossibleRise(bounded_condition(condition, domain, level=level), middle)
     lower, upper = divide_box(*condition.search_box(domain), [1 + i for i in constants], PIECES)
     reached = value if condition.readings is not None else condition.level_reached
-    least = (LEAST_LEVEL_UNDISTURBED if condition.practical else LEAST_LEVEL) * middle
+    least = (LEAST_LEVEL_UNDISTURBED if condition.is_undisturbed else LEAST_LEVEL) * middle
     highest = -minimum(
         lambda t, x: -reached(t, x).clamp_min(least), lower, upper, budget, possible, 0.0, bounded=bounded
     )

@@ -426,9 +426,12 @@ def test_the_command_takes_one_push_and_several(checkpoint, capsys, tmp_path):
     assert main([*line, "--disturbance=velocity=0,0.01", "--figure", str(tmp_path / "pushes.png")]) == 0
     assert "ends in: a box around" in capsys.readouterr().out
     assert (tmp_path / "pushes.png").stat().st_size > 1000
-    for wrong in (["--keep=proof"], ["--report=folder"], ["--disturbance=position=1"]):
-        assert main([*line, "--disturbance=velocity=0,0.01", *wrong]) == 2
-        assert "Expected one" in capsys.readouterr().err
+    for wrong, expected in (
+        ("--keep=proof", "Expected one disturbance"), ("--report=folder", "Expected one disturbance"),
+        ("--disturbance=position=1", "Expected a single --disturbance"),
+    ):  # fmt: skip
+        assert main([*line, "--disturbance=velocity=0,0.01", wrong]) == 2
+        assert expected in capsys.readouterr().err
 
 
 # Without disturbances

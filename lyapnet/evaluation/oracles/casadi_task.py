@@ -29,7 +29,6 @@ class CasadiTask:
     Attributes:
         graphs: the torch traces of these functions.
         step, end, inside: the CasADi functions; ∫ℓ is without s(u), and inside is None without constraints.
-        slopes: (x_n, u_n) ↦ (∂x_{n+1}/∂x_n, ∂x_{n+1}/∂u_n), as CasADi function.
 
     Args:
         problem: in float64 on the CPU.
@@ -43,11 +42,16 @@ class CasadiTask:
         system = problem.system
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         self.step = self._translate(self.step_in_torch, (x, u))
-        self.slopes = _slopes_of(self.step)
         self.end = self._translate(self.end_in_torch, (x,))
         self.inside = None if problem.constraints is None else self._translate(self.inside_in_torch, (x,))
         self._excess = None if problem.controls.excess(u) is None else self._translate(self.excess_in_torch, (u,))
         self._smooth, self._kinked = self._costs_of_controls(u)
+
+    def slopes(self) -> casadi.Function:
+        """(x_n, u_n) ↦ (∂x_{n+1}/∂x_n, ∂x_{n+1}/∂u_n)."""
+        x, u = self.step.mx_in()
+        following = self.step(x, u)[0]
+        return casadi.Function("slopes", [x, u], [casadi.jacobian(following, x), casadi.jacobian(following, u)])
 
     def step_in_torch(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_{n+1}, ∫ℓ over the step) without s(u); with Euler (x_n + Δt(f + gu), Δt (q + uᵀRu))."""
@@ -117,10 +121,3 @@ class CasadiTask:
         translated = casadi_function(self.graphs[-1], arguments)
         require_equal(translated, function, arguments)
         return translated
-
-
-def _slopes_of(step: casadi.Function) -> casadi.Function:
-    """(x, u) ↦ (∂x⁺/∂x, ∂x⁺/∂u) of a step (x, u) ↦ (x⁺, …)."""
-    x, u = step.mx_in()
-    following = step(x, u)[0]
-    return casadi.Function("slopes", [x, u], [casadi.jacobian(following, x), casadi.jacobian(following, u)])

@@ -6,6 +6,7 @@ A reference for tests and tables. The model is the torch system itself, translat
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
+from functools import cached_property
 from io import StringIO
 from typing import Any
 
@@ -84,7 +85,6 @@ class Transcription(Oracle):
         self._iterations = iterations
         self._most_iterations = 0  # largest number of iterations of a first minimum; 0: none yet
         self._scales = Scales(self.problem)
-        self._slopes = self.task.slopes.map(horizon.steps)
         assert limits is not None  # checked by oracle_of
         free = torch.full((system.n,), torch.inf)
         ends = (-free, free) if domain is None else domain.narrowed(DOMAIN_MARGIN)
@@ -287,6 +287,11 @@ class Transcription(Oracle):
             cost = float(J + self.problem.cost.terminal(nodes[-1]))
             admitted = bool(self._are_admitted(torch.stack(nodes)).all())
         return cost if admitted and abs(cost - minimum.cost) <= _tolerance(minimum.cost) else None
+
+    @cached_property
+    def _slopes(self) -> casadi.Function:
+        """The slopes of all steps; made when they are first asked for, since most tasks never do."""
+        return self.task.slopes().map(self.problem.horizon.steps)
 
     def _gains_along(self, x0: np.ndarray, minimum: Candidate) -> np.ndarray:
         """K (N, m, n) of linear-quadratic regulators with unit weights about a path, in units of the scales."""

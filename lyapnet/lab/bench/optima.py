@@ -8,13 +8,12 @@ import torch
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.threads import seconds_of_work
 from lyapnet.evaluation.oracles import optimal_cost
+from lyapnet.evaluation.oracles.multistart import SAME
 from lyapnet.lab.bench.cases import Case
 from lyapnet.training.optima import MAX_OPTIMA, minima, optima_for
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.training.start import expansions_of
 from lyapnet.value.expansions import Expansion
-
-EQUAL = 1e-6  # largest relative difference of two costs that count as equal
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class OptimaTiming:
     compared: int  # number of states whose J* is known
     largest_excess: float  # max (J − J*)/|J*|; NaN if none is known
     largest_saving: float  # max (J* − J)/|J*|
-    as_low: float  # share of these with (J − J*)/|J*| ≤ EQUAL
+    as_low: float  # share of these with (J − J*)/|J*| ≤ SAME
 
 
 def time_optima(case: Case, compared: int, report: StageReport = silent) -> OptimaTiming:
@@ -58,7 +57,7 @@ def time_optima(case: Case, compared: int, report: StageReport = silent) -> Opti
     worst, saved, share = math.nan, math.nan, math.nan
     if len(excess):
         worst, saved = float(excess.max()), float(-excess.min())
-        share = float((excess <= EQUAL).double().mean())
+        share = float((excess <= SAME).double().mean())
     size = problem.system.n, problem.system.m, problem.horizon.steps
     return OptimaTiming(
         case.name, *size, len(solutions.path.cost), len(path.cost), seconds, len(excess), worst, saved, share

@@ -5,8 +5,9 @@ from typing import Any
 
 from rich.table import Column, Table
 
+from lyapnet.evaluation.oracles.multistart import SAME
 from lyapnet.lab.bench.latency import Latency
-from lyapnet.lab.bench.optima import EQUAL, OptimaTiming
+from lyapnet.lab.bench.optima import OptimaTiming
 from lyapnet.lab.bench.proofs import Attempt
 from lyapnet.lab.bench.routes import BASELINE
 from lyapnet.lab.bench.tightness import Tightness
@@ -76,7 +77,7 @@ def optima_table(rows: Sequence[OptimaTiming]) -> Table:
     table.title = "optima from which a training starts, one thread"
     table.caption = (
         "excess and saving: the largest, relative to the oracle's cost; as low: the share of states with an excess of "
-        f"at most {EQUAL:.0e}"
+        f"at most {SAME:.0e}"
     )
     for row in rows:
         beside = ("–", "–", "–")

@@ -13,14 +13,16 @@ from lyapnet.cli.options import Debug, Delay, FirstDeviation, Given, Measured, a
 @with_controller_options
 def export(
     given: Given,
-    to: Annotated[str, typer.Option(help="c, fmu, onnx, torch or casadi.")],
+    to: Annotated[str, typer.Option(help="c, fmu, onnx, torch, casadi or st.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
-    name: Annotated[str, typer.Option(help="Prefix of names in C.")] = "lyapnet",
+    name: Annotated[str, typer.Option(help="Prefix of names in C and structured text.")] = "lyapnet",
     beyond: Annotated[
         str | None,
         typer.Option(help="The law after T: hold, receding or riccati; by default the one that keeps the goal."),
     ] = None,
-    dtype: Annotated[str, typer.Option(help="Type of numbers in C: float64 or float32.")] = "float64",
+    dtype: Annotated[
+        str, typer.Option(help="Type of numbers in C and structured text: float64 or float32.")
+    ] = "float64",
     fmi: Annotated[str, typer.Option(help="FMI version of an fmu: 2.0 or 3.0.")] = "2.0",
     estimator: Annotated[
         str | None,
@@ -41,9 +43,9 @@ def export(
 
     c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. fmu is a unit for
     co-simulation with that C inside. onnx is a model (t, x) ↦ (u, V) of one state, with p beside x for a family; torch
-    is the same for torch.export.load, and casadi a function (t, x) ↦ (u, V, V_x) for casadi.Function.load. With
-    --estimator c and fmu have the loop, readings y ↦ u with a step for each Δt, held against Python's over 10 000
-    steps.
+    is the same for torch.export.load, and casadi a function (t, x) ↦ (u, V, V_x) for casadi.Function.load. st is a
+    function block in structured text for programmable controllers, compared at 400 states. With --estimator c and fmu
+    have the loop, readings y ↦ u with a step for each Δt, held against Python's over 10 000 steps.
     """
     from lyapnet.exchange.export import export as write
 

@@ -25,7 +25,12 @@ STACK = 1_000_000  # largest size of the arrays of one function, in bytes; stack
 
 
 def c_function(
-    signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
+    signature: str,
+    graph: GraphModule,
+    arguments: dict[str, Tensor],
+    results: Sequence[str],
+    tables: Tables,
+    language: type[Text] = Text,
 ) -> tuple[str, int]:
     """(the text of a C function for a trace, the number of entries of its arrays on the stack).
 
@@ -35,11 +40,12 @@ def c_function(
         arguments: name of each array argument ↦ a tensor of its shape.
         results: the names of the arrays for the results.
         tables: collects the constants.
+        language: what the C will be translated to, for error messages.
 
     Raises:
         ExportError: an operator has no rule, or the arrays need more than STACK bytes.
     """
-    text = Text(tables)
+    text = language(tables)
     write_body(text, graph, arguments, results)
     lines, size = arrange_statements(text.statements, text.arrays)
     if 8 * size > STACK:

@@ -1,4 +1,4 @@
-"""A controller's law in other languages: C99, an FMU, ONNX, torch.export or CasADi, compared with the controller."""
+"""A controller's law as C99, an FMU, structured text, ONNX, torch.export or CasADi, compared with the controller."""
 
 from lyapnet.exchange.export.certified import CertifiedFiles
 from lyapnet.exchange.export.writing import FORMATS, Exported, compiled, export

@@ -12,22 +12,24 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import write_atomically
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.output_feedback import OutputFeedback
-from lyapnet.exchange.export import c, fmu, programs
+from lyapnet.exchange.export import c, fmu, programs, structured_text
 from lyapnet.exchange.export.c_loop import CompiledLoop, LoopTraces, verify_loop
 from lyapnet.exchange.export.facts import facts_of
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Agreement, points, verify
 
-FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2", "casadi": ".casadi"}
+FORMATS = {"c": "", "fmu": ".fmu", "onnx": ".onnx", "torch": ".pt2", "casadi": ".casadi", "st": ".st"}
 """Format ↦ the ending of its file; c is a folder."""
 IN_C = ("c", "fmu")
+NAMED = (*IN_C, "st")  # formats with a name and a precision of their own
 PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
     "casadi": (programs.casadi_function_of, programs.write_casadi, programs.run_casadi),
 }
 """Format ↦ (law ↦ program, the function that writes a program, the function that runs a file)."""
-DTYPES = {"float64": torch.float64, "float32": torch.float32}  # of the numbers in C
+DTYPES = {"float64": torch.float64, "float32": torch.float32}  # of the numbers in C and structured text
+STATES_IN_PYTHON = 400  # of the states of a comparison, on which a function block is computed in Python
 
 
 class Exported(NamedTuple):
@@ -50,17 +52,18 @@ def export(
 
     The export includes limits, target, parameters of a family and the law after T; t below 0 counts as 0. It is run on
     10 000 states, a loop over 10 000 steps, and compared with the controller. If they differ by more than rounding,
-    nothing is kept.
+    nothing is kept. Structured text is computed in Python, on STATES_IN_PYTHON of these states.
 
     Args:
         exported: a controller; or a controller with an estimator, from controller.with_estimator("ekf").
         path: a folder for c, a file for the other formats.
-        to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; onnx, a model
-            (t, x[, p]) ↦ (u, V) of one state; torch, the same for torch.export.load; casadi, a function with V_x too,
-            for casadi.Function.load.
+        to: a key of FORMATS: c, C99 without a library; fmu, a unit for co-simulation with that C inside; st, a function
+            block in structured text of IEC 61131-3 for programmable logic controllers; onnx, a model (t, x[, p]) ↦
+            (u, V) of one state; torch, the same for torch.export.load; casadi, a function with V_x too, for
+            casadi.Function.load.
         checkpoint: the checkpoint of the controller, for its digest in the files.
-        name: the first part of all names in C, so that several laws fit into one program.
-        dtype: float64 or float32, the type of the numbers in C.
+        name: the first part of all names in C and structured text, so that several laws fit into one program.
+        dtype: float64 or float32, the type of the numbers in C and structured text (LREAL, REAL).
         fmi: the version of a unit's interface, 2.0 or 3.0.
 
     Raises:
@@ -83,7 +86,7 @@ def export(
         raise UsageError(
             f"Expected an estimator with --to {' or '.join(IN_C)}, got {to}; the others have the law alone."
         )
-    facts, law = facts_of(controller, checkpoint), Law(controller, DTYPES[dtype] if to in IN_C else None)
+    facts, law = facts_of(controller, checkpoint), Law(controller, DTYPES[dtype] if to in NAMED else None)
     try:
         place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
     except OSError as error:
@@ -94,6 +97,8 @@ def export(
             style = c.Style(name, DTYPES[dtype])
             written = Written(controller, law, facts, style, loop)
             return _write_c(written, draft, path) if to == "c" else _write_fmu(written, draft, path, fmi)
+        if to == "st":
+            return _write_structured_text(controller, law, facts, c.Style(name, DTYPES[dtype]), path)
         make, write, run = PROGRAMS[to]
         made, file = make(law), draft / path.name
         write(made, file, facts)
@@ -159,8 +164,8 @@ def _require_name(name: str, to: str, path: Path) -> None:
     """Refuse a name that is none in C, a name for a format without names, and another name than in the same folder."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
-    if to not in IN_C and name != c.NAME:
-        raise UsageError(f"Expected no name for {to}, got {name!r}; the names in C alone have one.")
+    if to not in NAMED and name != c.NAME:
+        raise UsageError(f"Expected no name for {to}, got {name!r}; only {', '.join(NAMED)} have one.")
     header = path / "policy.h"
     if to == "c" and header.is_file() and f" {name}_control(" not in header.read_text(encoding="utf-8"):
         raise UsageError(
@@ -173,7 +178,7 @@ def _require_dtype(dtype: str, to: str) -> None:
     """Refuse an unknown dtype, and float32 for formats that have the precision of the controller."""
     if dtype not in DTYPES:
         raise UsageError(f"Expected a dtype among {', '.join(DTYPES)}, got {dtype!r}; choose one of them.")
-    if to not in IN_C and dtype != "float64":
+    if to not in NAMED and dtype != "float64":
         raise UsageError(f"Expected no dtype for {to}, got {dtype}; it has that of the controller.")
 
 
@@ -218,4 +223,18 @@ def _write_fmu(written: Written, draft: Path, path: Path, version: str) -> Expor
     looped, settings = written.traces is not None, 0 if written.traces is None else written.traces.settings
     fmu.write_fmu(file, version, sources, variables, written.style, written.controller, looped, settings, draft)
     write_atomically(path, file.read_bytes())
+    return Exported([path], agreement)
+
+
+def _write_structured_text(
+    controller: Controller, law: Law, facts: dict[str, str], style: c.Style, path: Path
+) -> Exported:
+    """Write a function block."""
+    tried, dtype = points(controller), style.dtype
+    text = structured_text.structured_text(controller, law, facts, style, tried)
+    some = tried.every(len(tried.t) // STATES_IN_PYTHON)
+    agreement = verify(controller, structured_text.run(text, law, dtype), some, dtype)
+    verified = {**facts, "verified": f"computed in Python, {agreement}"}
+    text = structured_text.structured_text(controller, law, verified, style, tried)
+    write_atomically(path, text.encode())
     return Exported([path], agreement)

@@ -83,7 +83,7 @@ class Basis(nn.Module, ABC):
     """Smooth functions of p (*batch, k), as many as nodes, at which values determine their coefficients."""
 
     @abstractmethod
-    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
+    def forward(self, p: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch nodes"]:
         """The functions at p, as many as `nodes`."""
 
     @abstractmethod
@@ -92,8 +92,7 @@ class Basis(nn.Module, ABC):
 
     def coefficients(self, values: Float[Tensor, "nodes *shape"]) -> Float[Tensor, "nodes *shape"]:
         """c with Σ c_k function_k = values at the nodes."""
-        matrix = torch.stack(self(self.nodes()), -1)
-        return torch.linalg.solve(matrix, values.flatten(1)).unflatten(-1, values.shape[1:])
+        return torch.linalg.solve(self(self.nodes()), values.flatten(1)).unflatten(-1, values.shape[1:])
 
     @abstractmethod
     def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
@@ -120,8 +119,8 @@ class ChebyshevProducts(Basis):
         self.register_buffer("center", (lower + upper) / 2, persistent=False)
         self.register_buffer("half_widths", torch.where(half > 0, half, 1.0), persistent=False)
 
-    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
-        return _products(self._along_axes(p))
+    def forward(self, p: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch nodes"]:
+        return torch.stack(_products(self._along_axes(p)), -1)
 
     def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
         """The gradient of Σ c_k function_k in p, by T_i' = i U_{i−1}; beyond the range that at its end."""
@@ -155,24 +154,34 @@ class FourierSeries(Basis):
         count: 2K + 1.
     """
 
+    slopes: Float[Tensor, " K"]  # dφ_k/dp of φ_k = kφ
+
     def __init__(self, period: float, count: int):
         super().__init__()
         self.period, self.highest = period, count // 2
+        slopes = torch.arange(1, self.highest + 1, dtype=torch.float64) * (2 * math.pi / period)
+        self.register_buffer("slopes", slopes, persistent=False)
 
-    def forward(self, p: Float[Tensor, "*batch k"]) -> list[Float[Tensor, "*batch"]]:
-        phase = p[..., 0] * (2 * math.pi / self.period)
-        cos, sin = phase.cos(), phase.sin()
-        cosines = _by_recurrence(cos, torch.ones_like(cos), cos, self.highest + 1)
-        sines = _by_recurrence(cos, torch.zeros_like(sin), sin, self.highest + 1)
-        return [*cosines, *sines[1:]]
+    def forward(self, p: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch nodes"]:
+        cosines, sines = self._waves(p)
+        return torch.cat([torch.ones_like(p), cosines, sines], -1)
 
     def gradient(self, p: Float[Tensor, "*batch k"], c: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch k"]:
-        of_one, *others = self(p)
-        cosines, sines = others[: self.highest], others[self.highest :]
-        rate = 2 * math.pi / self.period
-        slopes = [torch.zeros_like(of_one), *(-(k + 1) * rate * y for k, y in enumerate(sines))]
-        slopes += [(k + 1) * rate * y for k, y in enumerate(cosines)]
-        return (c * torch.stack(slopes, -1)).sum(-1, keepdim=True)
+        cosines, sines = self._waves(p)
+        slopes = torch.cat([torch.zeros_like(p), -self.slopes * sines, self.slopes * cosines], -1)
+        return (c * slopes).sum(-1, keepdim=True)
+
+    def _waves(self, p: Float[Tensor, "*batch k"]) -> tuple[Tensor, Tensor]:
+        """cos kφ and sin kφ for k = 1, …, K, each (*batch, K), by doubling: e^{i(k+m)φ} = e^{ikφ}e^{imφ}."""
+        phase = p * (2 * math.pi / self.period)
+        cosines, sines = phase.cos(), phase.sin()
+        while cosines.shape[-1] < self.highest:
+            cos, sin = cosines[..., -1:], sines[..., -1:]
+            cosines, sines = (
+                torch.cat([cosines, cos * cosines - sin * sines], -1),
+                torch.cat([sines, cos * sines + sin * cosines], -1),
+            )
+        return cosines[..., : self.highest], sines[..., : self.highest]
 
     def nodes(self) -> Float[Tensor, "nodes k"]:
         count = 2 * self.highest + 1
@@ -198,9 +207,9 @@ class Interpolant(nn.Module):
         return combine(self.basis(p), self.coefficients)
 
 
-def combine(functions: Sequence[Float[Tensor, "*batch"]], coefficients: Float[Tensor, "nodes *shape"]) -> Tensor:
+def combine(functions: Float[Tensor, "*batch nodes"], coefficients: Float[Tensor, "nodes *shape"]) -> Tensor:
     """Σ c_k function_k, (*batch, *shape)."""
-    return (torch.stack(list(functions), -1) @ coefficients.flatten(1)).unflatten(-1, coefficients.shape[1:])
+    return (functions @ coefficients.flatten(1)).unflatten(-1, coefficients.shape[1:])
 
 
 def fewest_products(

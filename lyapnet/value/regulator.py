@@ -75,7 +75,7 @@ class Regulator(nn.Module):
             feedback = apply(self.K, offset)
         else:
             products = self.basis(self._parameters_of(x))
-            feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(products, self.K, strict=True)])
+            feedback = _sum([b[..., None] * apply(K, offset) for b, K in zip(products.unbind(-1), self.K, strict=True)])
         # the law is relative to the control at the goal, which may differ from u* at x
         return self.problem.controls.project(self.problem.rest_at(x - offset) - feedback)
 
@@ -85,7 +85,7 @@ class Regulator(nn.Module):
         if self.basis is None:
             return quadratic_form(self.P, offset)
         products = self.basis(self._parameters_of(x))
-        return _sum([b * quadratic_form(P, offset) for b, P in zip(products, self.P, strict=True)])
+        return _sum([b * quadratic_form(P, offset) for b, P in zip(products.unbind(-1), self.P, strict=True)])
 
     def _parameters_of(self, x: State) -> Tensor:
         return x[..., list(self.problem.system.constants)]
@@ -167,7 +167,7 @@ def _fit(basis: ChebyshevProducts, exact: Problem, solve: _Solver) -> Gains:
         )
     between = exact.initial_states.sample(8, torch.Generator().manual_seed(0))[:, list(exact.system.constants)]
     at_nodes, at_others = ([solve(goal_of_member(exact, p)) for p in some] for some in (nodes, between))
-    others = np.asarray(torch.stack(basis(between), -1))
+    others = np.asarray(basis(between))
     coefficients = []
     for known, expected in zip(zip(*at_nodes, strict=True), zip(*at_others, strict=True), strict=True):
         found = basis.coefficients(torch.from_numpy(np.stack(known))).numpy()

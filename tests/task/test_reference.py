@@ -248,3 +248,10 @@ def test_a_file_that_is_not_there_or_one_besides_points(tmp_path):
 
 def test_a_system_has_nothing_to_follow_unless_told():
     assert problem_of(lyapnet.task.systems.DoubleIntegrator()).system.settings == ()
+
+
+def test_random_plants_are_refused():
+    config = config_from_plain({**TASK, "randomise": {"mass": [0.9, 1]}})
+    controller = lyapnet.Controller(build_problem(config), Clock(), policy=lyapnet.HJBPolicy, config=config)
+    with pytest.raises(UsageError, match="Expected randomise without reference, got both"):
+        assert controller.plants

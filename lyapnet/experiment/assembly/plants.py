@@ -35,7 +35,7 @@ def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
 
 def _require_support(config: Config) -> None:
     """Raise UsageError for settings that do not support random plants."""
-    for key, given in (("family", config.family), ("noise", config.noise)):
+    for key, given in (("family", config.family), ("noise", config.noise), ("reference", config.reference.points)):
         if given:
             raise UsageError(f"Expected randomise without {key}, got both; leave one of them out.")
     if config.horizon.stationary:

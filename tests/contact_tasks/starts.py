@@ -1,8 +1,9 @@
 """A controller's costs from published starts, beside optima: python -m tests.contact_tasks.starts CKPT pushing_1000.
 
 The optimum is the cheapest of differential dynamic programming from the law's controls, from softer contacts, and
-IPOPT from its own guesses and from these. With `walls 64` in the place of a name: the shares of 64 states of X₀ from
-which the law leans on a wall where the optimum does, and costs at most 1.05 times as much.
+IPOPT from its own guesses and from these. With `states 64` in the place of a name: the law's costs from 64 states of X₀
+beside these optima. With `walls 64`: the shares of 64 states of X₀ from which the law leans on a wall where the optimum
+does, and costs at most 1.05 times as much.
 """
 
 import sys
@@ -17,6 +18,7 @@ STARTS = {  # x₀ ↦ the best cost that was known, of five guesses
     "pushing_10": {(0, 1, 0, 0): 823.70},
     "pushing_100": {(0, 1, 0, 0): 786.95},
     "pushing_1000": {(0, 1, 0, 0): 801.81},
+    "dragging": {(0, 0, 0, 0): 6880.05},
     "walls_right": {(0.2, 0, 0.3, 0): 193.9, (0.3, 0, 0.6, 0): 1204.7, (0.3, -0.1, 0.5, 0): 695.3},
     "walls_tilted": {(0, 0.35, 0, 0): 403.6},
     "walls_left": {(-0.3, 0.2, 0, 0): 1774.3},
@@ -63,6 +65,21 @@ def best_of(problem, x0, u):
     return torch.stack([costs.amin(0), alone.nan_to_num(torch.inf), given.nan_to_num(torch.inf)]).amin(0), alone
 
 
+def report_states(controller, count):
+    """Print the law's costs from states of X₀ relative to the least found."""
+    problem = in_float64(controller.problem)
+    x0 = problem.initial_states.sample(count, torch.Generator().manual_seed(123)).double()
+    loop = controller.rollout(x0)
+    best, alone = best_of(problem, x0, loop.u)
+    ratio = loop.cost / best
+    print(
+        f"{count} states of X₀: mean cost {float(loop.cost.mean()):.4g}, mean best {float(best.mean()):.4g}, ratio "
+        f"{float(loop.cost.mean() / best.mean()):.4f}, median {float(ratio.median()):.4f}, worst "
+        f"{float(ratio.max()):.3f}, within 1.05: {float((ratio <= 1.05).double().mean()):.0%}, IPOPT alone / best "
+        f"{float(alone.nanmean() / best.mean()):.4f}, of {int(alone.isfinite().sum())}"
+    )
+
+
 def report_starts(controller, starts):
     """Print the costs of the law from some starts, beside optima."""
     x0 = torch.tensor([*starts], dtype=torch.float64)
@@ -85,7 +102,8 @@ def report_starts(controller, starts):
 
 if __name__ == "__main__":
     loaded = lyapnet.load(sys.argv[1])
-    if sys.argv[2] == "walls":
-        report_shares(loaded, int(sys.argv[3]))
+    reports = {"walls": report_shares, "states": report_states}
+    if sys.argv[2] in reports:
+        reports[sys.argv[2]](loaded, int(sys.argv[3]))
     else:
         report_starts(loaded, STARTS[sys.argv[2]])

@@ -141,6 +141,7 @@ def test_every_shipped_config_is_a_task_of_the_sheet():
         "kinematic_bicycle",
         "cartpole_walls",
         "pushing",
+        "dragging",
     }
     assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, *OWN, *alone}
     assert {path.stem for path in (CONF / "regions").glob("*.yaml")} == set(REGIONS)

@@ -11,118 +11,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from lyapnet.base.errors import ExportError
 from lyapnet.graphs.c_text import Tables, Text
+from lyapnet.graphs.structured_text_library import (
+    ELIMINATE_B,
+    ELIMINATION,
+    EXCHANGE_B,
+    FURTHER,
+    LARGEST_EXPONENT,
+    STANDARD,
+    SUBSTITUTE,
+)
 
-STANDARD = {  # function of the C library ↦ standard function of IEC 61131-3
-    "acos": "ACOS", "asin": "ASIN", "atan": "ATAN", "cos": "COS", "fabs": "ABS", "larger": "MAX",
-    "log": "LN", "log10": "LOG", "pow": "EXPT", "sin": "SIN", "smaller": "MIN", "sqrt": "SQRT", "tan": "TAN",
-}  # fmt: skip
-FURTHER = {  # further function ↦ its operands, and its body, in which @ is the name of the function
-    "exp": ("a", "@ := EXP(MIN(a, 87.0));"),  # below LARGEST, as a controller may stop at an overflow
-    "expm1": ("a", """
-        e := EXP(a);
-        IF e = 1.0 THEN
-            @ := a;
-        ELSIF e - 1.0 = -1.0 THEN
-            @ := -1.0;
-        ELSE
-            @ := (e - 1.0) * a / LN(e);
-        END_IF;
-    """),
-    "log1p": ("a", """
-        e := 1.0 + a;
-        IF e = 1.0 THEN
-            @ := a;
-        ELSE
-            @ := LN(e) * a / (e - 1.0);
-        END_IF;
-    """),
-    "tanh": ("a", """
-        e := expm1(-2.0 * ABS(a));
-        @ := -e / (2.0 + e);
-        IF a < 0.0 THEN
-            @ := -@;
-        END_IF;
-    """),
-    "sinh": ("a", """
-        e := expm1(ABS(a));
-        @ := 0.5 * (e + e / (1.0 + e));
-        IF a < 0.0 THEN
-            @ := -@;
-        END_IF;
-    """),
-    "cosh": ("a", "@ := 0.5 * (EXP(a) + EXP(-a));"),
-    "asinh": ("a", """
-        @ := log1p(ABS(a) + a * a / (1.0 + SQRT(1.0 + a * a)));
-        IF a < 0.0 THEN
-            @ := -@;
-        END_IF;
-    """),
-    "acosh": ("a", "@ := LN(a + SQRT(a * a - 1.0));"),
-    "atanh": ("a", "@ := 0.5 * log1p(2.0 * a / (1.0 - a));"),
-    "exp2": ("a", "@ := EXP(0.6931471805599453 * a);"),
-    "log2": ("a", "@ := LN(a) / 0.6931471805599453;"),
-    "floor": ("a", """
-        @ := a;
-        IF ABS(a) < 2.0E9 THEN
-            @ := DINT_TO_LREAL(LREAL_TO_DINT(a));
-            IF @ > a THEN
-                @ := @ - 1.0;
-            END_IF;
-        END_IF;
-    """),
-    "ceil": ("a", "@ := -floor(-a);"),
-    "trunc": ("a", """
-        @ := floor(ABS(a));
-        IF a < 0.0 THEN
-            @ := -@;
-        END_IF;
-    """),
-    "fmod": ("a, b", "@ := a - b * trunc(a / b);"),
-    "remainder_of": ("a, b", "@ := a - b * floor(a / b);"),
-    "hypot": ("a, b", "@ := SQRT(a * a + b * b);"),
-    "atan2": ("a, b", """
-        IF a = 0.0 AND b = 0.0 THEN
-            @ := 0.0;
-        ELSIF ABS(b) >= ABS(a) THEN
-            @ := ATAN(a / b);
-            IF b < 0.0 THEN
-                IF a >= 0.0 THEN
-                    @ := @ + 3.141592653589793;
-                ELSE
-                    @ := @ - 3.141592653589793;
-                END_IF;
-            END_IF;
-        ELSE
-            @ := 1.5707963267948966 - ATAN(b / a);
-            IF a < 0.0 THEN
-                @ := @ - 3.141592653589793;
-            END_IF;
-        END_IF;
-    """),
-    "erf": ("a", """
-        IF ABS(a) > 6.0 THEN
-            @ := 1.0;
-            IF a < 0.0 THEN
-                @ := -1.0;
-            END_IF;
-        ELSE
-            e := a;
-            @ := a;
-            FOR k := 1 TO 150 DO
-                e := e * 2.0 * a * a / (2.0 * DINT_TO_LREAL(k) + 1.0);
-                @ := @ + e;
-            END_FOR;
-            @ := 1.1283791670955126 * EXP(-a * a) * @;
-        END_IF;
-    """),
-    "erfc": ("a", "@ := 1.0 - erf(a);"),
-}  # fmt: skip
-LARGEST = 1e38  # largest number; it stands for infinity and NaN, for which there are no literals
+LEAST, LARGEST = 1.2e-38, 1e38  # sizes of literals; some compilers read them as REAL first
 PRECEDENCE = {"||": 1, "&&": 2, "==": 3, "!=": 3, "<": 4, ">": 4, "<=": 4, ">=": 4, "+": 5, "-": 5, "*": 6, "/": 6}
+LITERAL = re.compile(r"(?<![\w.])\d+\.\d+(?:E-?\d+)?(?![\w.])")
 SIGNS = {"||": "OR", "&&": "AND", "==": "=", "!=": "<>"}  # operators that are written otherwise than in C
 
 
@@ -141,10 +47,27 @@ class ArrayTables(Tables):
 
 
 def real(number: float) -> str:
-    """A number as a literal that keeps every bit; LARGEST for NaN, as a number above it and infinity."""
-    number = LARGEST if math.isnan(number) else min(max(number, -LARGEST), LARGEST)
+    """A number as a literal that keeps every bit.
+
+    Sizes are moved into [LEAST, LARGEST]; infinity and NaN are LARGEST.
+    """
+    if math.isnan(number):
+        number = LARGEST
+    elif number != 0:
+        number = math.copysign(min(max(abs(number), LEAST), LARGEST), number)
     digits, e, exponent = repr(float(number)).partition("e")
     return f"{digits if '.' in digits else digits + '.0'}{'E' if e else ''}{exponent.removeprefix('+')}"
+
+
+def in_single_precision(text: str) -> str:
+    """Structured text with REAL instead of LREAL, and with literals that are float32 numbers.
+
+    Some compilers take a literal as LREAL beside a REAL; then 0.1 would not be the REAL nearest to it.
+    """
+    text = text.replace(f"MIN(a, {LARGEST_EXPONENT['LREAL']})", f"MIN(a, {LARGEST_EXPONENT['REAL']})")
+    parts = re.split(r"(\(\*.*?\*\))", text, flags=re.DOTALL)  # every second one is a comment
+    parts[::2] = [LITERAL.sub(lambda literal: real(float(np.float32(literal[0]))), part) for part in parts[::2]]
+    return "".join(parts).replace("LREAL", "REAL")
 
 
 @dataclass
@@ -222,7 +145,8 @@ class _Translator:
         self.block.within(head, "END_FOR;", lambda: self.statement(node.stmt))
 
     def _write_if(self, node: Any) -> None:
-        self.block.choose(self._condition(node.cond), lambda: self.statement(node.iftrue))
+        otherwise = None if node.iffalse is None else lambda: self.statement(node.iffalse)
+        self.block.choose(self._condition(node.cond), lambda: self.statement(node.iftrue), otherwise)
 
     def _write_assignment(self, node: Any) -> None:
         into = self._number(node.lvalue)
@@ -328,6 +252,10 @@ class _Translator:
         if kind == "ID":
             if node.name in ("INFINITY", "NAN"):
                 return real(math.inf if node.name == "INFINITY" else math.nan)
+            if node.name not in self.block.numbers:
+                raise ExportError(
+                    f"Expected numbers and functions in the C of operators, got {node.name}; write it out."
+                )
             return node.name
         if kind == "ArrayRef":
             name = self._array(node.name.name)
@@ -373,54 +301,6 @@ def _entry(array: str, start: str, further: str) -> str:
     return f"{array}[{further if start == '0' else f'{start} + {further}'}]"
 
 
-ELIMINATION = """determinant := 1.0;
-FOR j0 := 0 TO {rows} DO
-    best := j0;
-    FOR j1 := j0 + 1 TO {rows} DO
-        IF ABS({A}[j1 * {n} + j0]) > ABS({A}[best * {n} + j0]) THEN
-            best := j1;
-        END_IF;
-    END_FOR;
-    IF best <> j0 THEN
-        FOR j1 := 0 TO {rows} DO
-            factor := {A}[j0 * {n} + j1];
-            {A}[j0 * {n} + j1] := {A}[best * {n} + j1];
-            {A}[best * {n} + j1] := factor;
-        END_FOR;
-@exchange_b
-        determinant := -determinant;
-    END_IF;
-    determinant := determinant * {A}[j0 * {n} + j0];
-    IF {A}[j0 * {n} + j0] <> 0.0 THEN
-        FOR j1 := j0 + 1 TO {rows} DO
-            factor := {A}[j1 * {n} + j0] / {A}[j0 * {n} + j0];
-            FOR j2 := j0 TO {rows} DO
-                {A}[j1 * {n} + j2] := {A}[j1 * {n} + j2] - factor * {A}[j0 * {n} + j2];
-            END_FOR;
-@eliminate_b
-        END_FOR;
-    END_IF;
-END_FOR;
-"""
-EXCHANGE_B = """        FOR j1 := 0 TO {columns} DO
-            factor := {b}[j0 * {k} + j1];
-            {b}[j0 * {k} + j1] := {b}[best * {k} + j1];
-            {b}[best * {k} + j1] := factor;
-        END_FOR;"""
-ELIMINATE_B = """            FOR j2 := 0 TO {columns} DO
-                {b}[j1 * {k} + j2] := {b}[j1 * {k} + j2] - factor * {b}[j0 * {k} + j2];
-            END_FOR;"""
-SUBSTITUTE = """FOR j2 := 0 TO {columns} DO
-    FOR j0 := {rows} TO 0 BY -1 DO
-        FOR j1 := j0 + 1 TO {rows} DO
-            {b}[j0 * {k} + j2] := {b}[j0 * {k} + j2] - {A}[j0 * {n} + j1] * {b}[j1 * {k} + j2];
-        END_FOR;
-        {b}[j0 * {k} + j2] := {b}[j0 * {k} + j2] / {A}[j0 * {n} + j0];
-    END_FOR;
-END_FOR;
-"""
-
-
 def translate(code: str, block: Block, scalars: Sequence[str], name: str) -> None:
     """Write the body of a C function into a block.
 
@@ -447,23 +327,3 @@ def declarations(names: set[str], kind: str) -> list[str]:
         return []
     ordered = sorted(names, key=lambda name: (re.sub(r"\d", "", name), int(re.sub(r"\D", "", name) or 0)))
     return f"{textwrap.fill(', '.join(ordered), 100)} : {kind};".splitlines()
-
-
-def further_functions(used: set[str], name: str) -> list[str]:
-    """The further functions that the block calls, and those that these call, each before it is called."""
-    needed = set(used)
-    for function in reversed(FURTHER):  # a function calls only earlier ones
-        if function in needed:
-            needed |= {other for other in FURTHER if re.search(rf"\b{other}\(", FURTHER[function][1])}
-    texts = list[str]()
-    for function, (operands, body) in FURTHER.items():
-        if function in needed:
-            for other in FURTHER:
-                body = re.sub(rf"\b{other}\(", f"{name}_{other}(", body)
-            body = textwrap.indent(textwrap.dedent(body).strip(), "    ").replace("@", f"{name}_{function}")
-            own = [f"    {each} : {kind};" for each, kind in (("e", "LREAL"), ("k", "DINT"))
-                   if re.search(rf"\b{each}\b", body)]  # fmt: skip
-            local = ["VAR", *own, "END_VAR"] if own else []
-            texts += [f"FUNCTION {name}_{function} : LREAL", "VAR_INPUT", f"    {operands} : LREAL;", "END_VAR", *local,
-                      body, "END_FUNCTION\n"]  # fmt: skip
-    return texts

@@ -106,6 +106,7 @@ def _declare(line: str, routine: _Routine, sizes: dict[str, int]) -> None:
 
 
 def _condition_in_python(condition: str) -> str:
-    for sign, written in (("<>", "!="), (" = ", " == "), ("AND", "and"), ("OR", "or"), ("NOT", "not")):
+    # & and |, since compilers may compute both sides of AND and OR
+    for sign, written in (("<>", "!="), (" = ", " == "), ("AND", "&"), ("OR", "|"), ("NOT", "not")):
         condition = condition.replace(sign, written)
     return condition

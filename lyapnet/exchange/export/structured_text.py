@@ -20,18 +20,19 @@ from lyapnet.graphs.structured_text_functions import (
     Block,
     StructuredText,
     declarations,
-    further_functions,
+    in_single_precision,
     real,
     translate,
 )
 from lyapnet.graphs.structured_text_in_python import in_python, standard_functions
+from lyapnet.graphs.structured_text_library import further_functions
 from lyapnet.task.domain import SLACK
 
 NOT_FINITE, OUTSIDE, OUTSIDE_X0, OUTSIDE_DOMAIN = (
     meaning[0] for meaning in (Bits.NOT_FINITE, Bits.OUTSIDE, Bits.OUTSIDE_X0, Bits.OUTSIDE_DOMAIN)
 )
 CODES = {
-    NOT_FINITE: "a number of x or u is not finite",
+    NOT_FINITE: "t or a number of x or u is not finite",
     OUTSIDE: "x is outside of the states on which u was compared, closed loops from X0 and 20 % around",
     OUTSIDE_X0: "x is outside of X0 at t <= 0",
     OUTSIDE_DOMAIN: "x is where f, g or the cost are not defined",
@@ -39,11 +40,10 @@ CODES = {
 WIDTH = 110  # of the comment at the top
 
 
-def structured_text(controller: Controller, law: Law, facts: Mapping[str, str], style: Style, tried: Points) -> str:
+def structured_text(controller: Controller, law: Law, style: Style, tried: Points) -> str:
     """The text of a function block for u(t, x), a return code and, if asked for, V(t, x).
 
     Args:
-        facts: lines for the comment at the top.
         style: the first part of all names; float64 is LREAL, float32 is REAL.
         tried: the points of the comparison; the code tells of states outside of their box.
 
@@ -66,11 +66,10 @@ def structured_text(controller: Controller, law: Law, facts: Mapping[str, str], 
     declared = [
         *(f"{array} : ARRAY [0..{size - 1}] OF LREAL;" for array, size in sorted(block.arrays.items())),
         *declarations(block.numbers, "LREAL"),
-        *declarations(block.counters | {"bit"}, "DINT"),
+        *declarations(block.counters | {"flag"}, "DINT"),
     ]
     meanings = "; ".join(f"{number}: {meaning}" for number, meaning in CODES.items())
     lines = [
-        _comment(facts),
         "TYPE", *types, "END_TYPE\n",
         *further_functions(block.functions, style.name),
         f"(* u(t, x), to be called every {controller.horizon.dt:g} s; code is 0, or a sum of:",
@@ -88,10 +87,10 @@ def structured_text(controller: Controller, law: Law, facts: Mapping[str, str], 
         "END_FUNCTION_BLOCK\n",
     ]  # fmt: skip
     text = "\n".join(lines)
-    return text.replace("LREAL", "REAL") if style.single else text
+    return in_single_precision(text) if style.single else text
 
 
-def _comment(facts: Mapping[str, str]) -> str:
+def comment(facts: Mapping[str, str]) -> str:
     """Facts as a comment, in ASCII, which all editors of controllers read."""
     known = {"₀": "0", "Δ": "d", "≤": "<=", "≥": ">=", "−": "-", "’": "'", "ᵀ": "'", "²": "^2", "±": "+-"}
     text = "\n   ".join(f"{key}: {value}" for key, value in facts.items())
@@ -116,38 +115,40 @@ def _code(
     def each_of(size: int, write: Callable[[], None]) -> None:
         block.within(f"FOR j0 := 0 TO {size - 1} DO", "END_FOR;", write)
 
-    def add_bit(number: int, *tests: tuple[int, str]) -> None:
-        """Set a bit unless tests hold, each of them for every j0 below a number."""
-        block.add("bit := 0;")
+    def add_flag(number: int, *tests: tuple[int, str]) -> None:
+        """Add a number to the code unless tests hold, each of them for every j0 below a number."""
+        block.add("flag := 0;")
         for size, test in tests:
-            each_of(size, lambda test=test: block.choose(f"NOT ({test})", lambda: block.add(f"bit := {number};")))
-        block.add("code := code + bit;")
+            each_of(size, lambda test=test: block.choose(f"NOT ({test})", lambda: block.add(f"flag := {number};")))
+        block.add("code := code + flag;")
 
     limits, m = limits_of(controller, style), controller.system.m
+    block.add("code := 0;")
+    finite = "ABS({0}) < " + real(LARGEST)  # before limits are applied: MAX and MIN may drop what is not finite
+    add_flag(NOT_FINITE, (n, finite.format("x[j0]")), (m, finite.format("u[j0]")), (1, finite.format("t")))
     if limits is not None and has_limits(controller.controls, style):
         add_box("limit", *limits)
         clamped = "u[j0] := MIN(MAX(u[j0], limit_lower[j0]), limit_upper[j0]);"
         each_of(m, lambda: block.add(clamped))
-    block.add("code := 0;")
-    add_bit(NOT_FINITE, (n, f"ABS(x[j0]) < {real(LARGEST)}"), (m, f"ABS(u[j0]) < {real(LARGEST)}"))
     add_box("known", tried.lower, tried.upper)
-    within = "{0} >= {1}_lower[{2}] AND {0} <= {1}_upper[{2}]"
+    within = "({0} >= {1}_lower[{2}]) AND ({0} <= {1}_upper[{2}])"
     parameters = [(inputs["p"], within.format("p[j0]", "known", f"{n} + j0"))] if inputs["p"] else []
-    add_bit(OUTSIDE, (n, within.format("x[j0]", "known", "j0")), *parameters)
+    add_flag(OUTSIDE, (n, within.format("x[j0]", "known", "j0")), *parameters)
     add_box("start", box.lower[:n], box.upper[:n])
     at_start = n, within.format("x[j0]", "start", "j0")
-    block.within("IF t <= 0.0 THEN", "END_IF;", lambda: add_bit(OUTSIDE_X0, at_start))
+    block.within("IF t <= 0.0 THEN", "END_IF;", lambda: add_flag(OUTSIDE_X0, at_start))
     if domain is not None:
         low, high = domain.narrowed(-SLACK)
         add_box("defined", low[:n], high[:n])
-        add_bit(OUTSIDE_DOMAIN, (n, within.format("x[j0]", "defined", "j0")))
+        add_flag(OUTSIDE_DOMAIN, (n, within.format("x[j0]", "defined", "j0")))
     return block.lines, tables
 
 
 class BlockInPython:
     """The function block of a text, computed in Python statement by statement; for one state at a time.
 
-    A division by zero, and a root or logarithm that is not defined, may stop a programmable controller. They raise.
+    A division by zero, an overflow, or a function where it is not defined may stop a programmable controller; here it
+    raises.
 
     Args:
         text: what `structured_text` has written.
@@ -161,7 +162,7 @@ class BlockInPython:
         exec(in_python(text), self._names)  # the text is our own
         (self._block,) = (value for name, value in self._names.items() if name.endswith("_law"))
 
-    def __call__(self, t: float, state: NDArray) -> tuple[list[float], float, int]:
+    def __call__(self, t: float, state: NDArray, with_value: bool = True) -> tuple[list[float], float, int]:
         """(u, V, code) at a time and a state, with the parameters of a family.
 
         Raises:
@@ -171,15 +172,12 @@ class BlockInPython:
         numbers = ([self._number(entry) for entry in array] for array in arrays)
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise"):
-                return self._block(self._number(t), *numbers, True)
-        except ArithmeticError as error:
-            reason = str(error)
-        except ValueError as error:  # of a root or a logarithm
-            reason = str(error)
-        raise ExportError(
-            "Expected a law without division by zero and undefined roots or logarithms, at which a programmable "
-            f"controller may stop, got {reason} at t = {t:g}, x = {np.round(state, 6).tolist()}; export it to c."
-        )
+                return self._block(self._number(t), *numbers, with_value)
+        except (ArithmeticError, ValueError) as error:  # ValueError: a root, a logarithm
+            raise ExportError(
+                "Expected a law without division by zero, overflow and undefined functions, at which a programmable "
+                f"controller may stop, got {error} at t = {t:g}, x = {np.round(state, 6).tolist()}; export it to c."
+            ) from error
 
 
 def run(text: str, law: Law, dtype: torch.dtype) -> Evaluate:

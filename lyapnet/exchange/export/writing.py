@@ -161,9 +161,11 @@ class Written:
 
 
 def _require_name(name: str, to: str, path: Path) -> None:
-    """Refuse a name that is none in C, a name for a format without names, and another name than in the same folder."""
+    """Refuse a name that C or structured text does not allow, one for other formats, and another one in a folder."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
+    if to == "st" and ("__" in name or name.endswith("_")):
+        raise UsageError(f"Expected a name without __ and without _ at its end for st, got {name!r}; choose another.")
     if to not in NAMED and name != c.NAME:
         raise UsageError(f"Expected no name for {to}, got {name!r}; only {', '.join(NAMED)} have one.")
     header = path / "policy.h"
@@ -231,10 +233,9 @@ def _write_structured_text(
 ) -> Exported:
     """Write a function block."""
     tried, dtype = points(controller), style.dtype
-    text = structured_text.structured_text(controller, law, facts, style, tried)
+    text = structured_text.structured_text(controller, law, style, tried)
     some = tried.every(len(tried.t) // STATES_IN_PYTHON)
     agreement = verify(controller, structured_text.run(text, law, dtype), some, dtype)
-    verified = {**facts, "verified": f"computed in Python, {agreement}"}
-    text = structured_text.structured_text(controller, law, verified, style, tried)
-    write_atomically(path, text.encode())
+    comment = structured_text.comment({**facts, "verified": f"computed in Python, {agreement}"})
+    write_atomically(path, (comment + text).encode())
     return Exported([path], agreement)

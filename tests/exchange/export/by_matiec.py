@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import lyapnet
 from lyapnet.controller.controller import Controller
@@ -38,7 +39,7 @@ CALL = """#include "iec_std_lib.h"
 #include "POUS.c"
 TIME __CURRENT_TIME;
 BOOL __DEBUG;
-int call(double t, const double *x, double *u)
+int call(@REAL t, const @REAL *x, @REAL *u)
 {
     static LYAPNET_LAW law;
     static int begun = 0;
@@ -54,32 +55,37 @@ int call(double t, const double *x, double *u)
 """
 
 
-def compare(controller: Controller, matiec: Path) -> Agreement:
+def compare(controller: Controller, matiec: Path, dtype: str) -> Agreement:
     """The differences of a compiled block from its controller."""
+    real, number = {"float64": ("double", np.float64), "float32": ("float", np.float32)}[dtype]
     n, m = controller.system.n - len(controller.system.constants), controller.system.m
     places = [f"law.X.value.table[{i}]" for i in range(n)]
     places += [f"law.P.value.table[{i}]" for i in range(controller.system.n - n)]
     inputs = " ".join(f"{place} = x[{i}];" for i, place in enumerate(places))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (path,), _ = export(controller, folder / "law.st", "st")
+        (path,), _ = export(controller, folder / "law.st", "st", dtype=dtype)
         path.write_text(path.read_text(encoding="ascii") + PROGRAM, encoding="ascii")
-        call = CALL.replace("@INPUTS", inputs).replace("@CONTROLS", str(m))
+        call = CALL.replace("@INPUTS", inputs).replace("@CONTROLS", str(m)).replace("@REAL", real)
         (folder / "call.c").write_text(call, encoding="ascii")
         _run([str(matiec / "iec2c"), "-I", str(matiec / "lib"), "-T", ".", "law.st"], folder)
         headers = ["-I", str(matiec / "lib" / "C"), "-I", "."]
         _run(["cc", "-O1", "-w", "-shared", "-fPIC", *headers, "call.c", "-o", "law.so", "-lm"], folder)
         library = ctypes.CDLL(str(folder / "law.so"))
-    library.call.argtypes = [ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p]
+    library.call.argtypes = [
+        ctypes.c_double if dtype == "float64" else ctypes.c_float,
+        ctypes.c_void_p,
+        ctypes.c_void_p,
+    ]
 
     def evaluate(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        results = np.empty((len(t), m + 1))
-        for time, state, result in zip(t, np.ascontiguousarray(x), results, strict=True):
+        results = np.empty((len(t), m + 1), number)
+        for time, state, result in zip(t, np.ascontiguousarray(x, number), results, strict=True):
             code = library.call(time, state.ctypes.data, result.ctypes.data)
             assert code == 0, f"code {code} at t = {time}, x = {state}"
         return results[:, :m], results[:, m]
 
-    return verify(controller, evaluate)
+    return verify(controller, evaluate, dtype=getattr(torch, dtype))
 
 
 def _run(command: list[str], folder: Path) -> None:
@@ -90,4 +96,5 @@ def _run(command: list[str], folder: Path) -> None:
 
 if __name__ == "__main__":
     for checkpoint in sys.argv[2:]:
-        print(checkpoint, compare(lyapnet.load(checkpoint), Path(sys.argv[1])), flush=True)
+        for dtype in ("float64", "float32"):
+            print(checkpoint, dtype, compare(lyapnet.load(checkpoint), Path(sys.argv[1]), dtype), flush=True)

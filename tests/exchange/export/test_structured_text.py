@@ -13,10 +13,11 @@ from lyapnet.controller.controller import Controller
 from lyapnet.exchange.export import export
 from lyapnet.exchange.export.c import Style
 from lyapnet.exchange.export.law import Law
-from lyapnet.exchange.export.structured_text import BlockInPython, run, structured_text
+from lyapnet.exchange.export.structured_text import BlockInPython, comment, run, structured_text
 from lyapnet.exchange.export.verification import Points, points
-from lyapnet.graphs.structured_text_functions import FURTHER, LARGEST, further_functions, real
+from lyapnet.graphs.structured_text_functions import in_single_precision, real
 from lyapnet.graphs.structured_text_in_python import in_python, standard_functions
+from lyapnet.graphs.structured_text_library import FURTHER, further_functions
 from lyapnet.task.systems import DoubleIntegrator
 from tests.exchange.export.test_export import KINDS, controller_of
 from tests.marks import sample
@@ -28,7 +29,7 @@ DOUBLE, SINGLE = torch.float64, torch.float32
 
 def text_of(controller, dtype=DOUBLE, tried=None):
     tried = points(controller) if tried is None else tried
-    return structured_text(controller, Law(controller, dtype), {}, Style(dtype=dtype), tried)
+    return structured_text(controller, Law(controller, dtype), Style(dtype=dtype), tried)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ TOLERANCES = {"float64": (1e-9, 1e-6), "float32": (1e-3, 3e-2)}  # as for C; of 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_block_agrees_with_the_controller(kind, dtype, tmp_path):
     if (kind, dtype) == ("limits on one side", "float32"):  # a limit of 1e150 stands for none
-        with pytest.raises(ExportError, match="overflow encountered"):
+        with pytest.raises(ExportError, match=r"overflow and .* got overflow encountered"):
             export(controller_of(kind), tmp_path / "law.st", "st", dtype=dtype)
         return
     (path,), agreement = export(controller_of(kind), tmp_path / "law.st", "st", dtype=dtype)
@@ -70,6 +71,37 @@ def test_a_code_tells_where_the_law_was_not_compared(limited):
     assert block(0.1, far)[2] == 2
     assert block(0.0, far)[2] == 2 + 4
     assert block(0.1, np.full(len(x0), np.nan))[2] == 1 + 2
+    assert block(math.nan, x0.numpy())[2] == 1
+
+
+def test_the_value_is_computed_when_asked_for(limited):
+    controller, text = limited
+    block, x = BlockInPython(text, Law(controller), DOUBLE), controller.initial_states.upper.numpy()
+    u, V, code = block(0.0, x)
+    assert pytest.approx(float(controller.value(0.0, x))) == V
+    assert block(0.0, x, with_value=False) == (u, 0.0, code)
+
+
+def test_parameters_outside_of_their_box_have_a_code():
+    controller = controller_of("a family")
+    block = BlockInPython(text_of(controller), Law(controller), DOUBLE)
+    state = controller.initial_states.center.numpy()
+    assert block(0.1, state)[2] == 0
+    state[-1] = 2 * controller.initial_states.upper[-1]
+    assert block(0.1, state)[2] == 2
+
+
+def test_a_comment_stays_a_comment():
+    text = comment({"x": "length *) END_FUNCTION_BLOCK (* (m)", "X₀": "−1 ≤ x ≤ 1, Δt, ‖x‖"})
+    assert text.isascii()
+    assert (text.count("(*"), text.count("*)")) == (1, 1)
+    assert "X0: -1 <= x <= 1, dt" in text
+
+
+def test_literals_in_single_precision_are_float32_numbers():
+    """Some compilers take a literal beside a REAL as LREAL."""
+    text = in_single_precision("(* every 0.1 s *) a := 0.1 * b[10] + 1.5E-05; EXP(MIN(a, 700.0))")
+    assert text == "(* every 0.1 s *) a := 0.10000000149011612 * b[10] + 1.4999999621068127E-05; EXP(MIN(a, 87.0))"
 
 
 @pytest.mark.gate
@@ -78,7 +110,8 @@ def test_limits_hold_in_single_precision():
     block = BlockInPython(text_of(controller, SINGLE), Law(controller, SINGLE), SINGLE)
     limit = float(controller.controls.upper.max())
     controls = [
-        block(0.0, x)[0][0] for x in controller.initial_states.sample(20, torch.Generator().manual_seed(0)).numpy()
+        float(block(0.0, x)[0][0])
+        for x in controller.initial_states.sample(20, torch.Generator().manual_seed(0)).numpy()
     ]
     assert max(map(abs, controls)) <= limit
     assert any(abs(u) > 0.99 * limit for u in controls), "a limit that is never reached tests nothing"
@@ -87,7 +120,7 @@ def test_limits_hold_in_single_precision():
 WRONG = {
     "another control": ("u[0] := ", "u[0] := 1.0E-6 + "),
     "another value": ("        V := ", "        V := 1.0E-6 + "),
-    "another function": ("EXP(MIN(a, 87.0))", "EXP(MIN(a, 0.0))"),
+    "another function": ("EXP(MIN(a, 700.0))", "EXP(MIN(a, 0.0))"),
 }
 
 
@@ -115,19 +148,25 @@ def test_further_functions_are_those_of_the_c_library(name):
     meaning = {"remainder_of": lambda a, b: a % b, "exp2": lambda a: 2**a}.get(name) or getattr(math, name)
     names = functions_in_python({name})
     draw = np.random.default_rng(0)
-    sides = {"acosh": (1.01, 9), "log2": (0.1, 9), "log1p": (-0.9, 9), "atanh": (-0.99, 0.99)}.get(name, (-3, 3))
+    sides = {"acosh": (1.01, 9), "log2": (0.1, 9), "log1p": (-0.9, 9), "atanh": (-0.99, 0.99), "erf": (-6.5, 6.5)}.get(
+        name, (-3, 3)
+    )
     for scale in (1.0, 1e-6) if sides[0] < 0 else (1.0,):
         for given in scale * draw.uniform(*sides, size=(200, operands)):
             assert names[f"own_{name}"](*given) == pytest.approx(meaning(*given), rel=1e-12, abs=1e-12 * scale)
 
 
 def test_corners_of_the_further_functions():
-    names = functions_in_python({"atan2", "floor", "tanh", "exp"})
+    names = functions_in_python({"atan2", "floor", "fmod", "remainder_of", "tanh", "exp"})
     for a, b in [(0.0, 0.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (1.0, -1e-300), (-2.0, -2.0)]:
         assert names["own_atan2"](a, b) == pytest.approx(math.atan2(a, b))
     assert [names["own_floor"](a) for a in (-2.0, -1.5, -0.5, 1.5, 2.5, 3.0)] == [-2, -2, -1, 1, 2, 3]
+    assert [names["own_floor"](a) for a in (2.5e9 + 0.5, -(2.5e9) - 0.5, 1e16)] == [2.5e9, -2.5e9 - 1, 1e16]
+    for a in (3.4999999999999996, -0.7000000000000001, 2.5e9 + 0.5):  # a / 0.7 may be rounded up to a whole number
+        assert names["own_remainder_of"](a, 0.7) == pytest.approx(a % 0.7, abs=1e-6 if a > 1e9 else 1e-15)
+        assert names["own_fmod"](a, 0.7) == pytest.approx(math.fmod(a, 0.7), abs=1e-6 if a > 1e9 else 1e-15)
     assert [names["own_tanh"](a) for a in (-500.0, 0.0, 500.0)] == [-1, 0, 1]
-    assert math.exp(80) < names["own_exp"](1e6) < LARGEST
+    assert names["own_exp"](1e6) == math.exp(700)
 
 
 FORMULAS = {
@@ -160,7 +199,7 @@ def test_each_kind_of_operation(name):
     controller = Controller(problem_of(DoubleIntegrator()), Formula(FORMULAS[name]))
     law, draw = Law(controller), torch.rand(40, 2, generator=torch.Generator().manual_seed(0), dtype=DOUBLE) * 2 - 1
     tried = Points(torch.linspace(0, 1, 40, dtype=DOUBLE), draw, draw.amin(0), draw.amax(0))
-    _, V = run(structured_text(controller, law, {}, Style(), tried), law, DOUBLE)(tried.t.numpy(), draw.numpy())
+    _, V = run(structured_text(controller, law, Style(), tried), law, DOUBLE)(tried.t.numpy(), draw.numpy())
     expected = FORMULAS[name](tried.t, draw).numpy()
     assert np.ptp(expected) > 0.1
     np.testing.assert_allclose(V, expected, rtol=1e-11, atol=1e-11)
@@ -168,7 +207,7 @@ def test_each_kind_of_operation(name):
 
 @pytest.mark.parametrize(("number", "text"), [
     (1.0, "1.0"), (-1e-05, "-1.0E-05"), (2.5e20, "2.5E20"),
-    (math.inf, "1.0E38"), (-1e150, "-1.0E38"), (math.nan, "1.0E38"),
+    (math.inf, "1.0E38"), (-1e150, "-1.0E38"), (math.nan, "1.0E38"), (-1e-300, "-1.2E-38"), (0.0, "0.0"),
 ])  # fmt: skip
 def test_literals_are_those_of_the_standard(number, text):
     assert real(number) == text
@@ -179,7 +218,9 @@ def test_a_division_by_zero_is_told(limited):
     broken = re.sub(r"(END_VAR\n    v0 := MAX\(t, 0.0\);)", r"\1\n    v1 := 1.0 / x[0];", text, count=1)
     block = BlockInPython(broken, Law(controller), DOUBLE)
     block(0.0, np.ones(2))
-    with pytest.raises(ExportError, match=r"without division by zero .* at t = 0, x = \[0.0, 1.0\]; export it to c"):
+    with pytest.raises(
+        ExportError, match=r"without division by zero, overflow .* at t = 0, x = \[0.0, 1.0\]; export it to c"
+    ):
         block(0.0, np.array([0.0, 1.0]))
 
 
@@ -187,6 +228,9 @@ def test_what_is_refused(tmp_path, monkeypatch):
     controller = controller_of("a limit, held")
     with pytest.raises(UsageError, match=r"Expected a name that ends in \.st"):
         export(controller, tmp_path / "law.txt", "st")
+    for name in ("a_", "a__b"):
+        with pytest.raises(UsageError, match="Expected a name without __ and without _ at its end"):
+            export(controller, tmp_path / "law.st", "st", name=name)
     monkeypatch.setitem(sys.modules, "pycparser.c_parser", None)
     with pytest.raises(ExportError, match=r"Expected pycparser, got .*; pip install 'lyapnet\[plc\]'"):
         export(controller, tmp_path / "law.st", "st")

@@ -57,7 +57,6 @@ def proved(readings, delta=1e-3, boxes=20_000, alpha=ALPHA):
     )  # fmt: skip
 
 
-@pytest.mark.gate
 def test_up_to_the_longest_hold_in_closed_form_it_is_certified():
     assert longest_hold() == pytest.approx(0.7321, abs=1e-4)
     claim = proved(held(0.97 * longest_hold()))
@@ -305,7 +304,6 @@ def test_a_held_law_keeps_its_region_and_enters_the_ultimate_set():
     assert claim.extent.contains(x).all()
 
 
-@pytest.mark.gate
 def test_where_the_held_law_is_unstable_no_region_is_claimed():
     """With u = −Kx held for Δt the eigenvalues of the sampled system leave the unit circle at some Δt."""
     A, B = torch.tensor([[0.0, 1.0], [0.0, 0.0]]), torch.tensor([[0.0], [1.0]])

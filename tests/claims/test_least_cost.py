@@ -13,6 +13,7 @@ from scipy.linalg import solve_continuous_are
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.certify import certify
 from lyapnet.claims.figures import two_sided
+from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.kinds import Funnel, LowerBound
 from lyapnet.claims.least_cost import RiseCondition, least_over_controls, least_pivot, prove_lower_bound
 from lyapnet.cli import main
@@ -256,8 +257,12 @@ def test_constants_that_a_control_moves_are_refused():
 
 def test_a_certificate_needs_an_excess_that_leaves_something():
     claim = plain_claim()
-    assert dataclasses.replace(claim, excess=math.inf).verdict == "unknown"
-    assert dataclasses.replace(claim, excess=claim.wanted).verdict == "unknown"
+    without = dataclasses.replace(claim, excess=claim.wanted)
+    assert dataclasses.replace(claim, excess=math.inf).verdict == without.verdict == "unknown"
+    controller = Controller(problem(), stationary(riccati()))
+    reasons = [LowerBoundCertificate(controller, each, {}).proved()["lower_reason"] for each in (claim, without)]
+    assert reasons[0] is None
+    assert "e is as large as the bound" in reasons[1]
 
 
 def test_where_nothing_is_proved_from_below_the_figure_is_drawn_all_the_same():

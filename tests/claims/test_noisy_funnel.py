@@ -133,7 +133,6 @@ def test_the_condition_vanishes_for_the_closed_form():
     assert (mean < 0).all()
 
 
-@pytest.mark.gate
 def test_the_closed_form_is_certified():
     claim = certified()
     assert claim.verdict == "certified"
@@ -309,7 +308,6 @@ def test_with_a_larger_leak_the_same_is_true(name):
     assert prove(**{**FALSE[name](), **larger[name]}).verdict == "certified"
 
 
-@pytest.mark.gate
 def test_a_proof_without_the_trace_term_would_certify_what_is_false(monkeypatch):
     """The twin of the planted claims: they notice a term that is left out."""
     monkeypatch.setattr(noisy_decrease, "noise_derivative", lambda V, sigma, t, x: 0 * x[..., 0])

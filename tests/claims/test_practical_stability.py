@@ -285,7 +285,6 @@ def test_a_kept_proof_is_checked_with_its_disturbance(kept):
     )
 
 
-@pytest.mark.gate
 def test_it_goes_on_by_the_same_disturbance_alone(kept, plain):
     before = kept.read_bytes()
     for w in (0.5 * W, 2 * W, 0 * W, None):

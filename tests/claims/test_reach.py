@@ -155,7 +155,6 @@ def paths(problem, V, x0, target, steps=4000, dt=0.002, seed=0, gain=1.0):
     return highest, reached
 
 
-@pytest.mark.gate
 def test_simulated_paths_keep_both_bounds():
     claim, V, count = certified(), value(), 1000
     corner = max(X0().corners(), key=lambda x: float(V(NOW, x)))
@@ -321,7 +320,6 @@ def noiseless():
     return Controller(problem, value(), policy=HJBPolicy)
 
 
-@pytest.mark.gate
 def test_a_controller_is_certified_from_python():
     certificate = lyapnet.certify(noiseless(), claim_of(noise={"x2": 0.3}), budget=AMPLE)
     assert certificate.verdict == "certified"
@@ -369,7 +367,6 @@ def test_a_forged_proof_is_refused(kept, tmp_path, name):
     assert check(controller, other)["verdict"] == "refused"
 
 
-@pytest.mark.gate
 def test_a_kept_proof_is_checked(kept):
     path, controller = kept
     again = check(controller, path)

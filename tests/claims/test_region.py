@@ -72,7 +72,6 @@ def after(about, x0, seconds=30.0, dt=0.01):
     return x
 
 
-@pytest.mark.gate
 def test_of_a_linear_law_the_largest_ellipse_in_the_set_is_proved():
     """min of xᵀPx on the face x_i = b is b²/(P⁻¹)_ii; the ellipse's area is πρ/√det P."""
     claim, P = plain_claim(), torch.from_numpy(riccati())
@@ -223,7 +222,6 @@ def test_where_the_goal_is_no_equilibrium_it_says_how_far_closed_loops_end():
     assert 0.01 <= near.offset <= float(torch.linalg.vector_norm(near.box.widths / 2))
 
 
-@pytest.mark.gate
 def test_a_certificate_does_not_say_the_goal_where_it_is_another_equilibrium():
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     about = problem(Shifted())

@@ -103,7 +103,6 @@ def test_a_linear_flow_and_its_cost_in_closed_form(straight):
     assert claim.bounds_of_cost(torch.tensor([[0.4, 0.0]]))[1].tolist() == [torch.inf], "outside X₀"
 
 
-@pytest.mark.gate
 def test_a_second_integrator_stays_within(swung):
     about = controller(Swinging(), Formula(damped))
     assert swung.verdict == "certified"
@@ -235,7 +234,6 @@ def test_without_the_bounds_they_would_be(monkeypatch):
     assert outside(prove_tube(about, Budget(20)), about)[0] > 0
 
 
-@pytest.mark.gate
 def test_the_certificate_and_its_figure(swung):
     certificate = TubeCertificate(controller(Swinging(), Formula(damped)), swung, {"seconds": 30.0, "seed": 0})
     assert certificate.result["verdict"] == "certified"

@@ -18,6 +18,7 @@ from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import branch_and_bound
 from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.task.sets import Box
 from tests.claims.planted import X0, riccati, stationary
 from tests.claims.test_least_cost import optimum, problem
 from tests.problems import Formula
@@ -45,7 +46,6 @@ def riccatis():
     return certify(controller, Tube(), LowerBound(beta=BETA, delta=DELTA))
 
 
-@pytest.mark.gate
 def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
     """The ratio comes from β and δT alone; a funnel would add α and δT from above."""
     result = riccatis.result
@@ -91,7 +91,6 @@ def test_one_of_the_sides_alone_is_no_certificate(riccatis):
     assert certificate.verdict == certificate.claim.verdict != "certified"
 
 
-@pytest.mark.gate
 def test_words_formulas_and_figure_are_about_both(riccatis):
     words, formulas = riccatis.in_words(), riccatis.in_formulas()
     assert "a tube, proved" in words
@@ -118,6 +117,17 @@ def test_the_command(capsys, tmp_path):
     assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## To repeat it", 1)[1]
 
 
+def test_a_tube_lies_in_a_set_that_is_as_large_on_each_side(riccatis):
+    ranges = riccatis.claim.ranges
+    lower, upper = ranges[..., 0].amin(0), ranges[..., 1].amax(0)
+    around = dataclasses.replace(riccatis.below.claim, states=Box(lower, upper))
+    assert riccatis.above.lies_in(around)
+    for i in range(len(lower)):
+        inwards = 1e-6 * torch.eye(len(lower), dtype=lower.dtype)[i]
+        for smaller in (Box(lower + inwards, upper), Box(lower, upper - inwards)):
+            assert not riccatis.above.lies_in(dataclasses.replace(around, states=smaller))
+
+
 @pytest.mark.parametrize("option", ["--beta=0.9", "--delta=0.1", "--set=-1:1,-1:1"])
 def test_what_is_of_the_other_side_is_refused_without_it(option, capsys):
     assert main(["certify", "tube", "zoo:double_integrator", option]) == 2
@@ -136,7 +146,6 @@ def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay()
     assert "the tube leaves D" in certificate.verdict_text()
 
 
-@pytest.mark.gate
 def test_with_half_a_tube_the_states_that_have_one_are_compared(riccatis, monkeypatch):
     claim = riccatis.claim
     kept = claim.cells.lower[:, 0] >= 0

@@ -47,6 +47,14 @@ def test_it_costs_so_much_per_second_and_nothing_at_the_goal():
     assert cost.terminal(x[1:2]).item() == pytest.approx(2.0 / (2 * 0.04**2))
 
 
+def test_a_widened_cost_ends_so_many_times_as_far_away():
+    """k(1 − e^{−(d/sw)²/2}) with the factor s: s² times the exponent's denominator."""
+    cost, x = problem_of().cost, torch.tensor([[0.1, 0.0], [0.03, -0.05]])
+    time_cost_of(cost).widening.fill_(3.0)
+    d = (x / torch.tensor([0.04, 0.08])).square().sum(-1)
+    assert cost.state(x).tolist() == pytest.approx((2.0 * (1 - torch.exp(-d / 2 / 9))).tolist())
+
+
 def test_it_moves_with_a_target_and_knows_periodic_angles():
     moved = problem_of(target={"position": 0.5}).cost
     goal = torch.tensor([[0.5, 0.0], [0.0, 0.0]])

@@ -231,7 +231,7 @@ def test_what_a_member_is_asked_for_and_cannot_be(trained):
     controller = lyapnet.load(trained)
     with pytest.raises(UsageError, match="Expected values for mass, length, got mass"):
         controller.with_(mass=1)
-    with pytest.raises(UsageError, match=r"Expected mass in \[0\.8, 1\.2\], which V knows, got 1\.3"):
+    with pytest.raises(UsageError, match=r"Expected mass in \[0\.8, 1\.2\], for which V was trained, got 1\.3"):
         controller.with_(mass=1.3, length=1)
     with pytest.raises(UsageError, match="Expected a controller of a family"):
         controller.with_(mass=1, length=1).with_(mass=1, length=1)

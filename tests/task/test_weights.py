@@ -364,7 +364,7 @@ def test_a_controller_is_told_weights_as_such(trained):
     assert abs(member.rollout(x).cost - controller.with_(Q_angle=2, R_torque=0.2).rollout(x).cost).min() > 1e-4
     for least in (0.02, 0.5):
         controller.with_(Q_angle=0.3, R_torque=least)
-    with pytest.raises(UsageError, match=r"Expected R_torque in \[0.02, 0.5\], which V knows, got 0.6"):
+    with pytest.raises(UsageError, match=r"Expected R_torque in \[0.02, 0.5\], for which V was trained, got 0.6"):
         controller.with_(Q_angle=2, R_torque=0.6)
     with pytest.raises(ValueError, match=r"Expected R_torque > 0, got -0\.1"):
         controller.policy(0, x, Q_angle=2, R_torque=-0.1)

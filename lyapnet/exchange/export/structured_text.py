@@ -172,12 +172,13 @@ class BlockInPython:
         numbers = ([self._number(entry) for entry in array] for array in arrays)
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise"):
-                return self._block(self._number(t), *numbers, with_value)
+                u, V, code = self._block(self._number(t), *numbers, with_value)
         except (ArithmeticError, ValueError) as error:  # ValueError: a root, a logarithm
             raise ExportError(
                 "Expected a law without division by zero, overflow and undefined functions, at which a programmable "
                 f"controller may stop, got {error} at t = {t:g}, x = {np.round(state, 6).tolist()}; export it to c."
             ) from error
+        return [float(number) for number in u], float(V), code
 
 
 def run(text: str, law: Law, dtype: torch.dtype) -> Evaluate:

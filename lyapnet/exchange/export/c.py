@@ -176,6 +176,20 @@ def has_limits(controls: ControlSet, style: Style) -> bool:
     return style.single and isinstance(controls, ControlBox) and controls.fixed_limits is not None
 
 
+def tested_boxes(controller: Controller, law: Law, tried: Points) -> dict[str, tuple[Tensor, Tensor]]:
+    """Name ↦ (lower, upper) of the boxes outside of which the return code is not 0.
+
+    known: states, and parameters, of the comparison; start: X₀; defined: where f, g and the cost are defined, if that
+    is not everywhere.
+    """
+    n, box, domain = len(law.arguments["x"]), controller.initial_states, controller.problem.domain
+    boxes = {"known": (tried.lower, tried.upper), "start": (box.lower[:n], box.upper[:n])}
+    if domain is not None:
+        low, high = domain.narrowed(-SLACK)
+        boxes["defined"] = low[:n], high[:n]
+    return boxes
+
+
 INSIDE = """static int is_inside(int n, const double *x, const double (*box)[2])
 {
     for (int i = 0; i < n; i++)
@@ -200,8 +214,8 @@ FINITE = """static int is_finite(int n, const double *x)
 
 def _entries(controller: Controller, law: Law, style: Style, tried: Points) -> str:
     """The functions of the header, with the tables of the boxes that they test."""
-    n, box, domain = len(law.arguments["x"]), controller.initial_states, controller.problem.domain
-    tables = [box_table("known", tried.lower, tried.upper), box_table("start", box.lower[:n], box.upper[:n])]
+    n, boxes = len(law.arguments["x"]), tested_boxes(controller, law, tried)
+    tables = [box_table(name, *box) for name, box in boxes.items()]
     given = ", ".join("&t" if argument == "t" else argument for argument in law.arguments)
     lines = [f"control_of({given}, u);"]
     limits = limits_of(controller, style)
@@ -212,9 +226,7 @@ def _entries(controller: Controller, law: Law, style: Style, tried: Points) -> s
     parameters = f" || !is_inside({len(tried.lower) - n}, p, known + {n})" if "p" in law.arguments else ""
     lines.append(f"if (!is_inside({n}, x, known){parameters}) code |= {style.macro}_OUTSIDE;")
     lines.append(f"if (t <= 0 && !is_inside({n}, x, start)) code |= {style.macro}_OUTSIDE_X0;")
-    if domain is not None:
-        low, high = domain.narrowed(-SLACK)
-        tables.append(box_table("defined", low[:n], high[:n]))
+    if "defined" in boxes:
         lines.append(f"if (!is_inside({n}, x, defined)) code |= {style.macro}_OUTSIDE_DOMAIN;")
     control, value = signatures(law, style)
     return "\n".join([

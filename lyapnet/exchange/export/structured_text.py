@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lyapnet.base.errors import ExportError
 from lyapnet.controller.controller import Controller
-from lyapnet.exchange.export.c import Bits, Style, has_limits, limits_of
+from lyapnet.exchange.export.c import Bits, Style, has_limits, limits_of, tested_boxes
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Evaluate, Points
 from lyapnet.graphs.c_functions import c_function
@@ -26,7 +26,6 @@ from lyapnet.graphs.structured_text_functions import (
 )
 from lyapnet.graphs.structured_text_in_python import in_python, standard_functions
 from lyapnet.graphs.structured_text_library import further_functions
-from lyapnet.task.domain import SLACK
 
 NOT_FINITE, OUTSIDE, OUTSIDE_X0, OUTSIDE_DOMAIN = (
     meaning[0] for meaning in (Bits.NOT_FINITE, Bits.OUTSIDE, Bits.OUTSIDE_X0, Bits.OUTSIDE_DOMAIN)
@@ -58,7 +57,7 @@ def structured_text(controller: Controller, law: Law, style: Style, tried: Point
         bodies[result] = block.lines
     n, m = len(law.arguments["x"]), controller.system.m
     inputs = {"x": n, "p": len(law.arguments.get("p", ()))}
-    codes, constants = _code(controller, style, tried, inputs)
+    codes, constants = _code(controller, style, tested_boxes(controller, law, tried), inputs)
     sizes = {"states": n, "controls": m, "parameters": inputs["p"]}
     types = [f"    {style.name}_{what} : ARRAY [0..{size - 1}] OF LREAL;" for what, size in sizes.items() if size]
     parameters = [f"    p : {style.name}_parameters;"] if inputs["p"] else []
@@ -101,11 +100,10 @@ def comment(facts: Mapping[str, str]) -> str:
 
 
 def _code(
-    controller: Controller, style: Style, tried: Points, inputs: Mapping[str, int]
+    controller: Controller, style: Style, boxes: Mapping[str, tuple[Tensor, Tensor]], inputs: Mapping[str, int]
 ) -> tuple[list[str], list[str]]:
     """(the statements that limit u in single precision and compute the return code, the tables that they need)."""
-    n, box, domain = inputs["x"], controller.initial_states, controller.problem.domain
-    block, tables = Block(depth=1), list[str]()
+    n, block, tables = inputs["x"], Block(depth=1), list[str]()
 
     def add_box(name: str, lower: Tensor, upper: Tensor) -> None:
         for side, numbers in (("lower", lower), ("upper", upper)):
@@ -130,16 +128,14 @@ def _code(
         add_box("limit", *limits)
         clamped = "u[j0] := MIN(MAX(u[j0], limit_lower[j0]), limit_upper[j0]);"
         each_of(m, lambda: block.add(clamped))
-    add_box("known", tried.lower, tried.upper)
+    for name, sides in boxes.items():
+        add_box(name, *sides)
     within = "({0} >= {1}_lower[{2}]) AND ({0} <= {1}_upper[{2}])"
     parameters = [(inputs["p"], within.format("p[j0]", "known", f"{n} + j0"))] if inputs["p"] else []
     add_flag(OUTSIDE, (n, within.format("x[j0]", "known", "j0")), *parameters)
-    add_box("start", box.lower[:n], box.upper[:n])
     at_start = n, within.format("x[j0]", "start", "j0")
     block.within("IF t <= 0.0 THEN", "END_IF;", lambda: add_flag(OUTSIDE_X0, at_start))
-    if domain is not None:
-        low, high = domain.narrowed(-SLACK)
-        add_box("defined", low[:n], high[:n])
+    if "defined" in boxes:
         add_flag(OUTSIDE_DOMAIN, (n, within.format("x[j0]", "defined", "j0")))
     return block.lines, tables
 

@@ -24,18 +24,18 @@ from lyapnet.base.files import digest_of_file, write_atomically
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
 
 
-def library_of(name: str, sources: tuple[Path, ...], *definitions: str) -> ctypes.CDLL:
+def library_of(name: str, sources: tuple[Path, ...], *options: str) -> ctypes.CDLL:
     """Load a compiled library from the cache, or compile it now.
 
     Args:
         name: the first part of the file name.
         sources: source files; the last one includes the others.
-        definitions: macros, as "NAME=value".
+        options: further options of the compiler, as "-DNAME=value" for a macro; the last one of a kind counts.
 
     Raises:
         CompilationError: there is no compiler, it fails, or another user can write to the cache.
     """
-    path, folder = file_of_library(name, sources, *definitions), cache_folder()
+    path, folder = file_of_library(name, sources, *options), cache_folder()
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     require_own(folder)
     digest = path.with_suffix(".sha256")
@@ -46,18 +46,18 @@ def library_of(name: str, sources: tuple[Path, ...], *definitions: str) -> ctype
         logging.getLogger(__name__).warning("note: compiling %s again: its digest does not match.", path)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".new_") as draft:
         file = Path(draft) / path.name
-        _compile(sources[-1], file, definitions)
+        _compile(sources[-1], file, options)
         write_atomically(digest, digest_of_file(file).encode())
         file.replace(path)
     return ctypes.CDLL(str(path))
 
 
-def _compile(source: Path, file: Path, definitions: Sequence[str]) -> None:
+def _compile(source: Path, file: Path, options: Sequence[str]) -> None:
     from torch._inductor.cpp_builder import get_cpp_compiler
 
     if not has_compiler():
         raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
-    command = [get_cpp_compiler(), *FLAGS, *(f"-D{each}" for each in definitions), str(source), "-o", str(file)]
+    command = [get_cpp_compiler(), *FLAGS, *options, str(source), "-o", str(file)]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
@@ -67,10 +67,10 @@ def _compile(source: Path, file: Path, definitions: Sequence[str]) -> None:
     file.chmod(0o600)
 
 
-def file_of_library(name: str, sources: Sequence[Path], *definitions: str) -> Path:
+def file_of_library(name: str, sources: Sequence[Path], *options: str) -> Path:
     """The file of a library; its name has a hash of the source, the compiler flags and the features of the CPU."""
     capabilities = sorted(torch.cpu.get_capabilities().items())
-    parts = [platform.machine(), capabilities, FLAGS, definitions, *(source.read_bytes() for source in sources)]
+    parts = [platform.machine(), capabilities, FLAGS, options, *(source.read_bytes() for source in sources)]
     return cache_folder() / f"{name}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
 
 

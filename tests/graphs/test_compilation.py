@@ -42,9 +42,9 @@ def rollout_of(*overrides):
 
 
 @needs_compiler
-def test_a_file_for_each_source_and_its_macros(source, cache, monkeypatch):
+def test_a_file_for_each_source_and_its_options(source, cache, monkeypatch):
     assert compilation.library_of("some", (source,)).number() == 7
-    assert compilation.library_of("some", (source,), "NUMBER=8").number() == 8
+    assert compilation.library_of("some", (source,), "-DNUMBER=8").number() == 8
     assert len(list(cache.glob("some_*.so"))) == 2
     monkeypatch.setattr(compilation, "has_compiler", lambda: False)
     assert compilation.library_of("some", (source,)).number() == 7, "from disk"

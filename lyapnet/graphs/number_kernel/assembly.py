@@ -21,26 +21,29 @@ NUMBERS = {torch.float64: "double", torch.float32: "float"}  # type of numbers â
 
 
 @cache
-def library(*definitions: str) -> ctypes.CDLL:
-    """The library compiled from program.cpp with some macro definitions; from the cache if it is there.
+def library(*options: str) -> ctypes.CDLL:
+    """The library compiled from program.cpp with some options; from the cache if it is there.
 
     Raises:
         CompilationError: as library_of.
     """
-    return library_of("numbers", (SOURCE,), *definitions)
+    return library_of("numbers", (SOURCE,), *options)
 
 
-def definitions(dtype: torch.dtype) -> tuple[str, str]:
-    """The macro definitions for program.cpp: the type of its numbers, and the elementwise instructions."""
+def compiler_options(dtype: torch.dtype) -> tuple[str, str, str]:
+    """The options for program.cpp: the type of its numbers, the elementwise instructions, and how much to optimise.
+
+    The source names the loops that have to be unrolled; -O3 takes longer and is no faster then.
+    """
     rows = (
         f"OPERANDS_{count}({name}, {expression})" for name, (count, expression) in elementwise_instructions().items()
     )
-    return f"NUMBER={NUMBERS[dtype]}", f"ELEMENTWISE={' '.join(rows)}"
+    return f"-DNUMBER={NUMBERS[dtype]}", f"-DELEMENTWISE={' '.join(rows)}", "-O2"
 
 
 def is_built(dtype: torch.dtype) -> bool:
     """Whether the C++ for a type of numbers is compiled already."""
-    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), *definitions(dtype)).is_file()
+    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), *compiler_options(dtype)).is_file()
 
 
 class _Memory(NamedTuple):
@@ -61,7 +64,7 @@ class AssembledProgram:
         self.dtype = next(each.dtype for each in reversed(arguments) if each.is_floating_point())
         if self.dtype not in NUMBERS or any(each.device.type != "cpu" for each in arguments):
             raise NotImplementedError(f"{self.dtype} on {arguments[-1].device}")
-        self._definitions = definitions(self.dtype)
+        self._options = compiler_options(self.dtype)
         self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
         self.result_shapes: list[torch.Size] = []
         self._arguments, self._results = list[int](), list[int]()  # indices of buffers; âˆ’1 for none
@@ -198,7 +201,7 @@ class AssembledProgram:
         return table
 
     def _function(self, name: str) -> Any:
-        return getattr(library(*self._definitions), f"lyapnet_{name}")
+        return getattr(library(*self._options), f"lyapnet_{name}")
 
 
 def _array(instructions: Sequence[Instruction]) -> np.ndarray:

@@ -20,6 +20,8 @@ constexpr int BYTES = 32;
 
 typedef int64_t Integer;
 
+#define UNROLLED _Pragma("GCC unroll 16")  // a loop of a few steps whose results stay in registers
+
 template <class T>
 struct Of;
 template <>
@@ -98,6 +100,7 @@ inline void scattered(T *to, Integer stride, typename Of<T>::V x, int count) {
 template <class V>
 inline auto total(V x) {
     auto sum = x[0];
+    UNROLLED
     for (unsigned i = 1; i < sizeof(V) / sizeof(x[0]); i++) sum += x[i];
     return sum;
 }
@@ -127,6 +130,7 @@ inline V absolute(V x) { return x < 0 ? -x : x + V{}; }
 inline Of<double>::V exponential_less_one(Of<double>::V r) {
     Of<double>::V tail = Of<double>::V{} + 1 / 6227020800.0;
     const double over[] = {479001600, 39916800, 3628800, 362880, 40320, 5040, 720, 120, 24, 6, 2};
+    UNROLLED
     for (double factorial : over) tail = tail * r + 1 / factorial;
     return r + r * r * tail;
 }
@@ -134,6 +138,7 @@ inline Of<double>::V exponential_less_one(Of<double>::V r) {
 inline Of<float>::V exponential_less_one(Of<float>::V r) {
     Of<float>::V tail = Of<float>::V{} + 1 / 5040.0f;
     const float over[] = {720, 120, 24, 6, 2};
+    UNROLLED
     for (float factorial : over) tail = tail * r + 1 / factorial;
     return r + r * r * tail;
 }
@@ -230,14 +235,17 @@ struct Machine {
 template <class T, int OPERANDS, class Visit>
 inline void for_each_row(int rank, const Integer *shape, Operand<T> (&operands)[OPERANDS], Visit visit) {
     T *at[OPERANDS];
+    UNROLLED
     for (int k = 0; k < OPERANDS; k++) at[k] = operands[k].at;
     Integer index[MOST_RANK] = {};
     while (true) {
         visit(at);
         int axis = rank - 2;
         for (; axis >= 0; axis--) {
+            UNROLLED
             for (int k = 0; k < OPERANDS; k++) at[k] += operands[k].strides[axis];
             if (++index[axis] < shape[axis]) break;
+            UNROLLED
             for (int k = 0; k < OPERANDS; k++) at[k] -= operands[k].strides[axis] * shape[axis];
             index[axis] = 0;
         }
@@ -265,6 +273,7 @@ void elementwise(const Machine<T> &machine, const Integer *row) {
     Operand<T> operands[INPUTS + 1];
     Integer strides[INPUTS + 1];
     bool in_line = true;
+    UNROLLED
     for (int k = 0; k <= INPUTS; k++) {
         operands[k] = machine.operand(row, rank);
         strides[k] = operands[k].strides[rank - 1];
@@ -396,13 +405,18 @@ inline void tile(Integer K, const T *A, Integer m_stride, Integer k_stride, cons
     V sums[ROWS][COLUMNS] = {};
     for (Integer k = 0; k < K; k++) {
         V b[COLUMNS];
+        UNROLLED
         for (int j = 0; j < COLUMNS; j++) b[j] = load(panel + (k * COLUMNS + j) * LANES);
+        UNROLLED
         for (int i = 0; i < ROWS; i++) {
             const V a = V{} + A[i * m_stride + k * k_stride];
+            UNROLLED
             for (int j = 0; j < COLUMNS; j++) sums[i][j] += a * b[j];
         }
     }
+    UNROLLED
     for (int i = 0; i < ROWS; i++)
+        UNROLLED
         for (int j = 0; j < COLUMNS; j++) {
             const int count = std::min<Integer>(LANES, width - j * LANES);
             if (count <= 0) break;
@@ -478,8 +492,10 @@ void by_rows(const Factors<T> &f, T *out, Integer row_stride, Integer column_str
         V sums[N] = {};
         for (Integer k = 0; k < f.K; k++) {
             const V a = load_some(f.A + m + k * f.k_of_a, count);
+            UNROLLED
             for (int n = 0; n < N; n++) sums[n] += a * f.B[k * f.k_of_b + n * f.n_stride];
         }
+        UNROLLED
         for (int n = 0; n < N; n++)
             for (int i = 0; i < count; i++) {
                 T &to = out[(m + i) * row_stride + n * column_stride];

@@ -3,6 +3,7 @@
 Commands import what they need when they run, so that help and misspelt options are answered at once.
 """
 
+import atexit
 import gc
 import os
 import re
@@ -33,6 +34,8 @@ from lyapnet.cli.zoo import demo, zoo
 # Allocations between two searches for garbage; with Python's 700 these take a seventh of a short training.
 ALLOCATIONS = 10_000
 CLOSED_OUTPUT = 141  # exit status of a process that the signal SIGPIPE ended; not every system has this signal
+
+atexit.register(gc.freeze)  # Python's last search for garbage takes a second, after which memory is free anyway
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

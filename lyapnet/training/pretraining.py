@@ -74,6 +74,13 @@ def method_for(problem: Problem) -> Method:
     return SMOOTH if problem.has_linear_law and problem.constraints is None else WITH_KINKS
 
 
+class Fit(NamedTuple):
+    """How a fit ended."""
+
+    excess: float  # mean cost of the fitted law relative to that of the optima, less 1; infinite if a loop is lost
+    gain_of_another_law: float  # relative cost that another law of V saves, if that has ended the fit, else 0
+
+
 class Examples(NamedTuple):
     """Data of V on optimal trajectories and near them, one row for each of k states."""
 
@@ -349,7 +356,7 @@ def fit(
     examples: Examples,
     report: StageReport = silent,
     gain_of_another_law: Callable[[], float] = lambda: 0.0,
-) -> float:
+) -> Fit:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
     The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, after PATIENCE
@@ -359,9 +366,6 @@ def fit(
     Args:
         report: called with each stage of the work.
         gain_of_another_law: the relative cost that another law of the current V saves, 0 if it does not save enough.
-
-    Returns:
-        What another law saves, if that has ended the fit, else 0.
     """
     fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _select_finite(optimum)
     beyond, gain_of_other = stream(learner.seed, START, 12), 0.0
@@ -391,7 +395,8 @@ def fit(
         for further in examples_beyond(learner, optimum, path, beyond, searching):
             examples = examples.concatenated_with(further)
     learner.V.load_state_dict(best)
-    return gain_of_other
+    lost, cost = -1 - least[0], least[1]
+    return Fit(math.inf if lost else (cost - float(optimum.path.cost.mean())) / size, gain_of_other)
 
 
 def looks_ahead(learner: Learner) -> bool:

@@ -18,7 +18,16 @@ from lyapnet.training.candidates import MIN_LOOKAHEAD_GAIN, ZERO_VALUE, Candidat
 from lyapnet.training.initial_networks import network_of, raise_to_costs, start_from, start_from_zero
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
-from lyapnet.training.pretraining import Examples, draw_examples, fit, fit_briefly, looks_ahead, misfit, relative_misfit
+from lyapnet.training.pretraining import (
+    Examples,
+    Fit,
+    draw_examples,
+    fit,
+    fit_briefly,
+    looks_ahead,
+    misfit,
+    relative_misfit,
+)
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.expansions import (
     TRIES,
@@ -107,17 +116,17 @@ def choose_start(
         problem, expansions.get(base.name), x0[:TEST_STATES], partial(report, f"improving on {base.name}")
     )
     may_look_ahead = may_look_ahead and not problem.risk  # which that law does not know
-    optimum, gain_ahead = None, 0.0
+    optimum, fitted = None, Fit(math.inf, 0.0)
     if seeks_optima:
-        optimum, gain_ahead = _fit_to_optima(learners, list(expansions.values()), drawn, base, trials, may_look_ahead)
+        optimum, fitted = _fit_to_optima(learners, list(expansions.values()), drawn, base, trials, may_look_ahead)
     chosen = _cheapest(trials.tried)
     if chosen.name == ZERO_VALUE:
         for network, state in zip(networks, drawn, strict=True):
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost:
                 network.scale.fill_(abs(chosen.cost))
-    policy = learners[0].rollout.closed_loop.policy
-    if seeks_optima and type(policy) is SampledPolicy:
+    policy, gain_ahead = learners[0].rollout.closed_loop.policy, fitted.gain_of_another_law
+    if seeks_optima and type(policy) is SampledPolicy and fitted.excess > MIN_LOOKAHEAD_GAIN:  # no law saves more
         report("closed loops of the law that looks ahead")
         gain_ahead = gain_ahead or _gain_by_looking_ahead(policy, x0[:TEST_STATES])
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
@@ -220,7 +229,7 @@ def _fit_to_optima(
     base: Candidate,
     trials: "_Trials",
     may_look_ahead: bool,
-) -> tuple[Optimum | None, float]:
+) -> tuple[Optimum | None, Fit]:
     """Fit the networks to optimal trajectories.
 
     If the fitted networks are no better than the base candidate, they are restored.
@@ -229,7 +238,7 @@ def _fit_to_optima(
         may_look_ahead: whether a fit may end early because the lookahead law of its V costs much less.
 
     Returns:
-        The optimal trajectories, None if there are none; and what the lookahead law saves, if fits have ended early.
+        The optimal trajectories, None if there are none; and how the fits ended: the largest excess, the least gain.
     """
     problem, x0, report = learners[0].problem, trials.x0, trials.report
     before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
@@ -239,12 +248,12 @@ def _fit_to_optima(
         solutions = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
         trials.leave_out("optima from states of X₀", singular(error))
-        return None, 0.0
+        return None, Fit(math.inf, 0.0)
     optimum = minima(problem, solutions)
     found = len(optimum.path.cost)
     if not found:
         trials.leave_out("optima from states of X₀", _reason_for_no_optimum(solutions))
-        return None, 0.0
+        return None, Fit(math.inf, 0.0)
     examples = draw_examples(problem, optimum, stream(0, START, 4), looks_ahead(learners[0]))
     name = f"{found} optima from states of X₀"
     trials.note(name, _describe_replaced_derivatives(optimum))
@@ -254,7 +263,7 @@ def _fit_to_optima(
         rivals.append(trials.roll_out("the regulator, up to where it is right"))
         if _cheapest(rivals) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
-    gains = list[float]()
+    fits = list[Fit]()
     for learner in learners:
         policy = learner.rollout.closed_loop.policy
 
@@ -264,12 +273,13 @@ def _fit_to_optima(
             gain = _gain_by_looking_ahead(policy, x0[:TEST_STATES], typically=True)
             return gain if gain > MIN_LOOKAHEAD_GAIN else 0.0
 
-        gains.append(fit(learner, optimum, examples, report, gain_by_looking_ahead))
+        fits.append(fit(learner, optimum, examples, report, gain_by_looking_ahead))
     fitted = trials.roll_out(name)
     if _cheapest([*rivals, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
-    return optimum, min(gains)
+    excess, gain = zip(*fits, strict=True)
+    return optimum, Fit(max(excess), min(gain))
 
 
 def _reason_for_no_optimum(solutions: Optimum) -> Missing:

@@ -11,7 +11,8 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
-from lyapnet.training.start import _gain_by_looking_ahead
+from lyapnet.training.pretraining import Fit
+from lyapnet.training.start import _gain_by_looking_ahead, choose_start
 from lyapnet.value.expansions import riccati
 from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
 from tests.fits import shorten_fits
@@ -104,6 +105,17 @@ def test_the_same_v_under_the_law_that_looks_ahead():
     law = LookaheadPolicy(learner.problem, learner.V)
     expected = costs_of_holding(law, learner.problem.horizon, learner.problem, x0)
     torch.testing.assert_close(ahead.path_from(x0).cost, expected.double(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize(("excess", "asked"), [(0.02, 0), (0.1, 1)])
+def test_a_law_close_to_the_optima_has_nothing_to_save(excess, asked, monkeypatch):
+    calls = list[torch.Tensor]()
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 6)
+    monkeypatch.setattr("lyapnet.training.start.fit", lambda *_: Fit(excess, 0.0))
+    monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: calls.append(x0) or 0.01)
+    config = config_from_plain(TASK, FEW)
+    choose_start([build_learner(config, build_problem(config))])
+    assert len(calls) == asked
 
 
 def test_little_is_no_reason():

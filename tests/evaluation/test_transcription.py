@@ -4,7 +4,6 @@ import math
 import random
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -544,11 +543,22 @@ def test_what_grows_from_less_than_ipopts_tolerance_counts(system, x0):
     assert optima.failures == 1 or float(optima.cost) > least
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_rounding_is_relative_to_the_costs_of_the_task(size, monkeypatch):
+    cost = QuadraticCost(size * torch.eye(2), size * torch.eye(1), size * torch.eye(2))
+    oracle, found = found_from(problem_of(DoubleIntegrator(), cost), [1.0, -0.5])
+    x0 = torch.tensor([[1.0, -0.5]])
+    monkeypatch.setattr(oracle, "_cost_along", lambda *_: None)
+    for factor, confirmed in ((1.0, True), (1.0001, False)):
+        search = MultiStart(x0.numpy(), [found._replace(cost=factor * found.cost)], oracle.minimise)
+        assert bool(oracle._verify(x0, search, [None])[0].isfinite()) is confirmed
+
+
 def test_a_cheaper_rollout_is_no_confirmation_of_a_dearer_path(monkeypatch):
     oracle, found = found_from(pole_of_ten_seconds(growth=0.1), [1.0, -0.5])
     x0 = torch.tensor([[1.0, -0.5]])
     monkeypatch.setattr(oracle, "_cost_along", lambda *_: 2 * found.cost)
-    search = SimpleNamespace(best=[found._replace(cost=2 * found.cost)], reasons=[""])
+    search = MultiStart(x0.numpy(), [found._replace(cost=2 * found.cost)], oracle.minimise)
     cost, reasons, _ = oracle._verify(x0, search, [None])
     assert math.isnan(float(cost))
     assert "in a rollout of its controls" in reasons[0]

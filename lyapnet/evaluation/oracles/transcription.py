@@ -34,6 +34,7 @@ GOAL_OFFSET = 1e-3  # distance from the goal at which initial lines end, in unit
 START_OFFSET = 1e-8  # shift of x₀ if slopes do not exist there, in units of the extents
 INVALID = "IPOPT: Invalid_Number_Detected"
 DOMAIN_MARGIN = 1e-6  # distance of optima from the borders of the domain, relative to a state's size
+ROUNDING = 1e-9  # difference of two costs that counts as rounding, relative to the size of J*
 SECONDS = 10.0  # IPOPT's seconds for one initial guess
 BRIEF_ITERATIONS = 40, 150  # smallest and largest limit of iterations, if a minimum of the state is known
 BRIEF_FACTOR = 3  # this limit, relative to the iterations of a first minimum
@@ -261,7 +262,7 @@ class Transcription(Oracle):
         u = torch.full((self.problem.horizon.steps, len(states), self.problem.system.m), math.nan, dtype=torch.float64)
         reasons = list[str]()
         for i, (best, candidate) in enumerate(zip(search.best, replayed, strict=True)):
-            reason = _reason_to_reject(best, candidate, given[i], search.reasons[i])
+            reason = self._reason_to_reject(states[i], best, candidate, given[i], search.reasons[i])
             if not reason and candidate is not None:
                 cost[i], u[:, i] = candidate.cost, torch.from_numpy(candidate.u)
             elif best is not None and not (is_better(candidate, best) or is_better(given[i], best)):
@@ -270,6 +271,21 @@ class Transcription(Oracle):
                     cost[i], reason = along, ""
             reasons.append(reason)
         return cost, reasons, u
+
+    def _reason_to_reject(
+        self, x0: State, best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str
+    ) -> str:
+        """The reason why a cost is not accepted as the optimum; empty if it is accepted."""
+        if best is None:
+            return reason
+        if replayed is None or abs(replayed.cost - best.cost) > self._tolerance(best.cost, x0):
+            got = "no finite number" if replayed is None else f"{replayed.cost:.9g}"
+            return f"IPOPT's cost {best.cost:.9g} is {got} in a rollout of its controls"
+        return _reason_against(given, replayed)
+
+    def _tolerance(self, cost: float, x0: State) -> float:
+        """The difference up to which IPOPT's cost and that in torch count as equal."""
+        return SAME * abs(cost) + ROUNDING * self._scales.of_cost(x0.numpy())
 
     def _cost_along(self, x0: State, minimum: Candidate) -> float | None:
         """The cost of a closed loop that stays on a minimum's path; None if it differs from that of the minimum.
@@ -286,7 +302,7 @@ class Transcription(Oracle):
                 nodes, J = [*nodes, following], J + step_cost
             cost = float(J + self.problem.cost.terminal(nodes[-1]))
             admitted = bool(self._are_admitted(torch.stack(nodes)).all())
-        return cost if admitted and abs(cost - minimum.cost) <= _tolerance(minimum.cost) else None
+        return cost if admitted and abs(cost - minimum.cost) <= self._tolerance(minimum.cost, x0) else None
 
     @cached_property
     def _slopes(self) -> casadi.Function:
@@ -315,26 +331,11 @@ def _with_fallback(search: MultiStart, i: int, starts: Sequence[Candidate], last
         yield last
 
 
-def _reason_to_reject(best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str) -> str:
-    """The reason why a cost is not accepted as the optimum; empty if it is accepted."""
-    if best is None:
-        return reason
-    if replayed is None or abs(replayed.cost - best.cost) > _tolerance(best.cost):
-        got = "no finite number" if replayed is None else f"{replayed.cost:.9g}"
-        return f"IPOPT's cost {best.cost:.9g} is {got} in a rollout of its controls"
-    return _reason_against(given, replayed)
-
-
 def _reason_against(given: Candidate | None, best: Candidate) -> str:
     """The reason why a minimum is not the optimum: cheaper known controls; empty if there are none."""
     if is_better(given, best):
         return f"known controls cost less than the {best.cost:.6g} of every local minimum that was found"
     return ""
-
-
-def _tolerance(cost: float) -> float:
-    """The difference up to which IPOPT's cost and that in torch count as equal."""
-    return SAME * abs(cost) + 1e-9
 
 
 class _IterationLimit(casadi.Callback):

@@ -11,11 +11,11 @@ from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.optimality import in_spreads
+from lyapnet.evaluation.worst_states import excess
 from lyapnet.loop.programs import LyapunovProgram, RegionProgram, ValueProgram
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import ObstacleCost, spread
 from lyapnet.training.learner import Learner
-from lyapnet.training.lost_states import excess
 from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.stage_messages import silent
 from lyapnet.value.after_horizon import choose_law

@@ -23,7 +23,7 @@ COMPARED_SHARE = 0.9  # share of validation states, the cheapest, in that cost; 
 class Best:
     """The best weights of a member so far, with the state needed to continue from them."""
 
-    loss: float = math.inf  # least validation loss
+    loss: float = math.inf  # least selection loss
     step: int = 0
     cost: float = math.inf  # mean cost of the validation states
     cheapest: float = math.inf  # mean cost of the cheapest COMPARED_SHARE of them
@@ -36,11 +36,11 @@ class Best:
 class ReturnToBest(Callback):
     """Returns a member to its best weights if its closed loops cost more, during or at the end of its training.
 
-    The best weights are those of the least validation loss, as in best.ckpt. Training is worse if the mean cost of the
-    validation states exceeds that of the best weights by more than WORSE_BY. After WORSE_FOR steps of this, or at once
-    if the cheapest COMPARED_SHARE of the states cost DIVERGENCE_COST_RATIO times as much, weights and optimizer return
-    to their best state, and the learning rate becomes a third. A member that is worse after its last step gets its best
-    weights, from which a resumed or fine-tuned run starts.
+    The best weights are those of the least selection loss of `Learner`, as in best.ckpt. Training is worse if the mean
+    cost of the validation states exceeds that of the best weights by more than WORSE_BY. After WORSE_FOR steps of this,
+    or at once if the cheapest COMPARED_SHARE of the states cost DIVERGENCE_COST_RATIO times as much, weights and
+    optimizer return to their best state, and the learning rate becomes a third. A member that is worse after its last
+    step gets its best weights, from which a resumed or fine-tuned run starts.
 
     Without a goal costs are relative to the spread of V(0, x₀), under noise to that of the costs if it is larger:
     V(0, x₀) may be nearly the same on all of X₀.
@@ -118,14 +118,14 @@ class ReturnToBest(Callback):
 
 
 def _measures(member: Learner) -> tuple[float, float, float, float]:
-    """The validation loss, the mean cost, that of the cheapest states, and the spread of costs."""
+    """The selection loss, the mean cost, that of the cheapest states, and the spread of costs."""
     assert member.validation is not None
     costs = member.validation.cost.nan_to_num(math.inf).sort().values
     cheapest = costs[: math.ceil(COMPARED_SHARE * len(costs))]
     size = float(spread(member.validation.value))
     if member.problem.noise is not None:
         size = max(size, float(spread(cheapest)))
-    return member.validation_loss, float(costs.mean()), float(cheapest.mean()), size
+    return member.selection_loss, float(costs.mean()), float(cheapest.mean()), size
 
 
 def _copy_of(state: Mapping[str, Any]) -> dict[str, Any]:

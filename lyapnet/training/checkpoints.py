@@ -96,7 +96,7 @@ class Checkpoints(Checkpoint):
     def _save_best(self, trainer: Trainer, module: Any) -> None:
         _save_logs(trainer)
         for member in module.members:
-            loss = number_over_processes(member.validation_loss, module.device)
+            loss = number_over_processes(member.selection_loss, module.device)
             if loss < self.best_loss[member.label]:
                 self.best_loss[member.label] = loss
                 module.save_member(member, self.best[member.label])

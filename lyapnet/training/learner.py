@@ -81,6 +81,7 @@ class Learner(nn.Module):
         self.output: ProgramOutput | None = None  # also None once its training has ended
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
+        self.lost_excess: float = 0.0  # largest excess of a gravely lost state that was found at the last validation
         self.measured_at: int = -1  # step of the last validation
         self.rate_share: float = 1.0  # factor of its scheduled learning rate, see ReturnToBest
         self.cooling: tuple[int, int] | None = None  # first and last step of the final decay of its learning rate
@@ -148,6 +149,15 @@ class Learner(nn.Module):
             output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
         )
         return output.loss
+
+    @property
+    def selection_loss(self) -> float:
+        """The loss of which the least chooses the best weights: the validation loss and, if it contains the relative
+        cost, the excess of the worst lost state that was found, as if it were one more validation state.
+        """
+        assert self.validation is not None
+        weight = self.program.trajectory_cost if self.program.normalise and self.region_share is None else 0.0
+        return self.validation_loss + weight * self.lost_excess / (len(self.validation.cost) + 1)
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
         """The validation loss; stored in `validation_loss`, with the table of states in `validation`.

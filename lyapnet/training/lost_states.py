@@ -1,21 +1,21 @@
 """Lost states: initial states from which the closed loop costs more than V predicts. Training uses them again."""
 
+from functools import partial
 from typing import Any, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import DivergenceError
-from lyapnet.base.random_streams import LOST
+from lyapnet.base.random_streams import LOST, stream
 from lyapnet.base.types import PerState, State
-from lyapnet.loop.programs.terms import value_floored
-from lyapnet.task.cost import spread
+from lyapnet.evaluation.worst_states import MIN_EXCESS, excess, search_near_worst
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
 
 SEARCHED_STATES = 512  # random states of X₀ that are tested at each validation
 MAX_LOST_STATES = 256  # most recent lost states kept
-MIN_EXCESS = 0.05  # relative excess of the cost over V(0, x₀) above which a state counts as lost
+GRAVE_EXCESS = 0.5  # relative excess over V(0, x₀) from which on it counts in the choice of the best weights
 
 
 class LostStates(Callback):
@@ -25,6 +25,10 @@ class LostStates(Callback):
     optimum from one state in a thousand. The mean cost on X₀ then depends on states that are rare in the batches. The
     searched states are used neither for validation nor for tests. Mildly lost states are included, because training on
     the worst ones alone makes V worse elsewhere.
+
+    If some random states are lost, states near the worst of them are tested too: beside a cliff of the cost closed
+    loops cost more already. These searches find failures that are too rare for the validation states, and the largest
+    excess counts in the choice of the best weights, see `Learner.selection_loss`. Training uses the random ones.
     """
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -35,20 +39,25 @@ class LostStates(Callback):
         data, module = data_of(trainer), cast(Any, pl_module)
         x0 = data.further(SEARCHED_STATES, trainer.global_step)
         try:
-            excesses = module.without_gradient(x0.to(module.device), _excess_of)
+            found = module.without_gradient(x0.to(module.device), partial(_search, step=trainer.global_step))
         except DivergenceError:  # a training batch that diverges is handled by the training itself
             return
         states_of_each = x0.reshape(-1, *x0.shape[-2:])
-        each = zip(with_loggers(trainer, pl_module), data.of_each, states_of_each, excesses, strict=True)
-        for (_, loggers), member_data, states, by in each:
-            lost = (by > MIN_EXCESS).cpu()
+        each = zip(with_loggers(trainer, pl_module), data.of_each, states_of_each, found, strict=True)
+        for (member, loggers), member_data, states, (excesses, largest) in each:
+            lost = (excesses > MIN_EXCESS).cpu()
             member_data.lost = torch.cat([states.cpu()[lost], member_data.lost])[:MAX_LOST_STATES]
-            log_scalars(trainer, loggers, {"lost_fraction/val": lost.double().mean()})
+            if member.measured_at == trainer.global_step:  # its training had not ended earlier
+                member.lost_excess = largest if largest > GRAVE_EXCESS else 0.0
+            scalars = {"lost_fraction/val": lost.double().mean(), "largest_excess/val": torch.tensor(largest)}
+            log_scalars(trainer, loggers, scalars)
 
 
-def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
-    """The excess (J_N − V(0, x₀)) / V(0, x₀) of the cost over V; without a goal, relative to the spread of J_N."""
-    return (cost - value) / (value_floored(value, cost) if has_goal else spread(cost))
+def _search(learner: Learner, x0: State, step: int) -> tuple[PerState, float]:
+    """The excesses from random states of X₀, and the largest that is found from them and near the worst of them."""
+    excesses, generator = _excess_of(learner, x0), stream(learner.seed, LOST, step, 1)
+    measure = partial(_excess_of, learner)
+    return excesses, float(search_near_worst(learner.problem.initial_states, x0, excesses, measure, generator)[1].max())
 
 
 def _excess_of(learner: Learner, x0: State) -> PerState:

@@ -61,9 +61,9 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         FigureLogger(every * options.figures_every, options.animate),
         *([certified] if options.certify_every else []),
         TrainingProgress(stages),
+        *([LostStates()] if config.training.lost_share else []),
         ReturnToBest(config.training.least_gain > 0, partial(console.print, soft_wrap=True), run.note_return),
         Settling(config.training.least_gain, config.training.warmup, stages),
-        *([LostStates()] if config.training.lost_share else []),
         *plan.callbacks,
         Checkpoints(run.last, best, every, partial(run.note, saved=True)),
     ]

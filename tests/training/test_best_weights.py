@@ -30,8 +30,8 @@ def config(tmp_path):
 class Validations:
     """Replaces what validations measure by costs of a list, the first at step 0, and keeps V at each of them."""
 
-    def __init__(self, monkeypatch, costs, loss=math.log, values=torch.ones):
-        self.costs, self.loss, self.values = costs, loss, values
+    def __init__(self, monkeypatch, costs, loss=math.log, values=torch.ones, excesses=(0,) * 7):
+        self.costs, self.loss, self.values, self.excesses = costs, loss, values, excesses
         self.weights: dict[int, dict[str, torch.Tensor]] = {}
         self.original = MEASURE_ON
         monkeypatch.setattr(best_weights, "WORSE_FOR", 4)
@@ -44,6 +44,7 @@ class Validations:
         costs = own if isinstance(own, torch.Tensor) else torch.full((STATES,), float(own))
         learner.validation = replace(learner.validation, cost=costs, value=self.values(STATES))
         learner.validation_loss = self.loss(float(costs.mean()))
+        learner.lost_excess = float(self.excesses[step // 2])
         self.weights[step] = {name: value.clone() for name, value in learner.V.state_dict().items()}
         return torch.tensor(learner.validation_loss)
 
@@ -95,6 +96,21 @@ def test_it_ends_with_its_best_weights(config, capsys, monkeypatch):
     assert "worse" not in out
     assert same(weights_of(run), seen.weights[12])
     assert not same(weights_of(run), seen.weights[8])
+
+
+@pytest.mark.parametrize(("excess", "best"), [(0, 2), (0.05 * STATES, 2), (0.2 * STATES, 4)])
+def test_a_lost_state_counts_as_one_more_validation_state(excess, best, config, monkeypatch):
+    seen = Validations(monkeypatch, [3, 2, 2.2, 3, 3, 3, 3], excesses=[0, excess, 0, 0, 0, 0, 0])
+    run = train(config, console=Console(quiet=True))
+    assert same(weights_of(run, "best"), seen.weights[best])
+
+
+@pytest.mark.parametrize("program", [{"normalise": False}, {"trajectory_cost": 0, "constraint": 1}])
+def test_a_loss_without_relative_costs_knows_no_lost_states(program, config, monkeypatch):
+    config["program"] |= program
+    seen = Validations(monkeypatch, [3, 2, 2.2, 3, 3, 3, 3], excesses=[0, 1000, 0, 0, 0, 0, 0])
+    run = train(config, console=Console(quiet=True))
+    assert same(weights_of(run, "best"), seen.weights[2])
 
 
 def test_a_loss_that_rises_alone_sends_nothing_back(config, capsys, monkeypatch):

@@ -8,12 +8,13 @@ import torch
 import lyapnet
 from lyapnet.base.errors import DivergenceError
 from lyapnet.base.random_streams import LOST, stream
+from lyapnet.evaluation.worst_states import MIN_EXCESS, SPREAD, excess, search_near_worst
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Linear
 from lyapnet.training import lost_states
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.training.lost_states import MAX_LOST_STATES, MIN_EXCESS, SEARCHED_STATES, excess
+from lyapnet.training.lost_states import MAX_LOST_STATES, SEARCHED_STATES
 from lyapnet.training.validation_optimum import COMPARED_STATES
 from tests.marks import sample
 from tests.problems import problem_of
@@ -76,6 +77,38 @@ def test_which_of_them_depends_on_seed_process_and_step_alone():
 def test_excess_is_relative_to_what_v_says_or_to_the_typical_cost():
     cost, value = torch.tensor([2.0, 1.0, 1.0, 1.2]), torch.tensor([1.0, 1.0, 2.0, 0.0])
     assert excess(cost, value).tolist() == pytest.approx([1.0, 0.0, -0.5, 1.2 / 0.05])
+
+
+def excess_beside_a_cliff(x0):
+    """10 % within 0.1 of the line x₁ = 0.3, and a hundred times V within a thousandth of it."""
+    distance = (x0[:, 0] - 0.3).abs()
+    return 0.1 * (distance < 0.1) + 99.0 * (distance < 1e-3)
+
+
+def found_beside_a_cliff(seed):
+    """Whether a search finds the cliff, whether its random states meet it, and the states that were tested."""
+    x0 = PROBLEM.initial_states.sample(SEARCHED_STATES, torch.Generator().manual_seed(seed))
+    excesses = excess_beside_a_cliff(x0)
+    generator = torch.Generator().manual_seed(seed)
+    tested, found = search_near_worst(PROBLEM.initial_states, x0, excesses, excess_beside_a_cliff, generator)
+    assert torch.equal(found, excess_beside_a_cliff(tested))
+    assert torch.equal(tested[:SEARCHED_STATES], x0)
+    return float(found.max()) > 50, float(excesses.max()) > 50, tested
+
+
+def test_a_search_near_the_worst_states_finds_what_is_rare():
+    by_search, by_chance, tested = zip(*map(found_beside_a_cliff, range(8)), strict=True)
+    assert sum(by_search) == 8 > 5 > sum(by_chance)
+    further = torch.cat([x0[SEARCHED_STATES:] for x0 in tested])
+    assert (further.abs() <= torch.tensor([1.0, 0.7])).all(), "all are states of X₀"
+    assert ((further[:, 0] - 0.3).abs() < 0.1 + 10 * SPREAD).all(), "and near the worst"
+
+
+def test_without_lost_states_nothing_more_is_tested():
+    x0 = PROBLEM.initial_states.sample(8, torch.Generator().manual_seed(0))
+    mild = torch.full((8,), 0.99 * MIN_EXCESS)
+    same = search_near_worst(PROBLEM.initial_states, x0, mild, lambda _: pytest.fail("tested"), torch.Generator())
+    assert all(map(torch.equal, same, (x0, mild)))
 
 
 @pytest.mark.gate

@@ -49,6 +49,7 @@ def known_then(evaluation):
 
 LATER = (
     "worst_corner",
+    "worst_found",
     "worst_ratio",
     "lost_fraction",
     "falling_fraction",

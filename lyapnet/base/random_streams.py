@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST, NOISE, PLANTS, OUTPUTS = range(11)
+TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST, NOISE, PLANTS, OUTPUTS, SEARCH = range(12)
 
 
 def stream(seed: int, *path: int) -> torch.Generator:

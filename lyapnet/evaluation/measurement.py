@@ -9,7 +9,7 @@ import torch
 
 from lyapnet.base.errors import DivergenceError, OracleError
 from lyapnet.base.files import plain
-from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.random_streams import SEARCH, TEST, stream
 from lyapnet.base.sizes import require_memory, size_of_loops
 from lyapnet.base.tables import csv_text
 from lyapnet.base.types import PerState, State
@@ -23,6 +23,7 @@ from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 from lyapnet.evaluation.under_noise import NoiseMeasures, measure_under_noise
 from lyapnet.evaluation.with_estimator import EstimatorMeasures, loops_with_estimator, measure_with_estimator
+from lyapnet.evaluation.worst_states import excess, search_near_worst
 from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import moving_states
@@ -35,12 +36,12 @@ TOO_MUCH_SPREAD = "log E exp(θJ)/θ is not measured, because too few of these p
 CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
 
-class Corner(NamedTuple):
-    """The corner of X₀ with the most expensive closed loop; uniform samples hardly ever come near a corner."""
+class Dearest(NamedTuple):
+    """The state with the most expensive closed loop of some chosen ones, which random states hardly ever come near."""
 
-    count: int  # number of tested corners
+    count: int  # number of tested states
     x0: list[float]
-    cost: float | None  # J; None if a closed loop from a corner is not finite
+    cost: float | None  # J; None if a closed loop from there is not finite
     value: float  # V(0, x₀)
 
 
@@ -52,7 +53,8 @@ class Evaluation(NamedTuple):
     notes: Sequence[str]  # the reason why J* is missing for each row of the table; empty if it is known
     seed: int
     problem: Problem
-    corner: Corner
+    corner: Dearest  # of the corners of X₀
+    found: Dearest | None  # by a search near the states that cost most relative to V; None if none is lost
     held_cost: PerState | None  # cost from each state in continuous time with u held; infinite if it diverges
     lqr_cost: PerState | None  # cost from each state under LQR; None if there is no such law
     at_goal: float | None  # share of closed loops that the law after T keeps near the goal; None: see share_at_goal
@@ -95,6 +97,7 @@ class Evaluation(NamedTuple):
             **self._note(),
             "program": self.program,
             "worst_corner": self.corner._asdict(),
+            **({} if self.found is None else {"worst_found": self.found._asdict()}),
         }
 
     def _terminal_errors(self) -> dict[str, float]:
@@ -223,7 +226,8 @@ def _evaluation_on_model(
     corner, problem = dearest_corner(controller), controller.problem
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
     later = share_at_goal(controller, first.x0[:LOOPS]), controller.law.beyond
-    further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0), *later)
+    further = (seed, problem, corner, _dearest_near_worst(controller, first, seed), held)
+    further = (*further, costs_of_lqr(problem, first.x0), *later)
     if not optimum:
         return Evaluation(first, paper, [NOT_ASKED] * samples, *further)
     try:
@@ -246,7 +250,7 @@ def _evaluation_under_noise(
     table, noise, lqr = measure_under_noise(controller, x0, paths, samples, seed, progress)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     lqr, after = None if lqr is None else lqr[:samples], controller.law.beyond
-    further = (seed, problem, dearest_corner(controller, noise=seed), None, lqr, None, after)
+    further = (seed, problem, dearest_corner(controller, noise=seed), None, None, lqr, None, after)
     about, notes = "", [""] * samples
     if noise.risk and noise.with_risk is None:
         notes = [TOO_MUCH_SPREAD] * samples
@@ -261,19 +265,40 @@ def _evaluation_under_noise(
     return Evaluation(first, paper, notes, *further, about, noise)
 
 
-def dearest_corner(controller: Controller, noise: int | None = None) -> Corner:
+def _dearest_near_worst(controller: Controller, table: StateTable, seed: int) -> Dearest | None:
+    """The most expensive state of a search near those of a table that cost most relative to V; None if none is lost."""
+    has_goal, tested = controller.problem.has_goal, list[tuple[State, PerState, PerState]]()
+
+    def excesses_from(x0: State) -> PerState:
+        cost, value = _cost_and_value(controller, x0)
+        tested.append((x0, cost, value))
+        return excess(cost, value, has_goal)
+
+    excesses, generator = excess(table.cost, table.value, has_goal), stream(seed, TEST, SEARCH)
+    search_near_worst(controller.initial_states, table.x0, excesses, excesses_from, generator)
+    return _dearest(*(torch.cat(column) for column in zip(*tested, strict=True))) if tested else None
+
+
+def _cost_and_value(controller: Controller, x0: State, noise: int | None = None) -> tuple[PerState, PerState]:
+    """J and V(0, x₀) from some states; J is infinite for all if a closed loop is not finite."""
+    with torch.no_grad():
+        value = controller.value(0.0, x0)
+        try:
+            return cost_within_domain(controller.problem, controller.rollout(x0, noise=noise))[0], value
+        except DivergenceError:
+            return torch.full_like(value, torch.inf), value
+
+
+def _dearest(x0: State, cost: PerState, value: PerState) -> Dearest:
+    i = int(cost.argmax())
+    return Dearest(len(x0), x0[i].tolist(), float(cost[i]) if bool(cost[i].isfinite()) else None, float(value[i]))
+
+
+def dearest_corner(controller: Controller, noise: int | None = None) -> Dearest:
     """The corner of X₀ with the most expensive closed loop, among the corners along its first CORNER_AXES axes.
 
     Args:
         noise: seed of one path of the noise from each corner; None: without noise.
     """
     x0 = controller.initial_states.corners(CORNER_AXES)
-    with torch.no_grad():
-        value = controller.value(0.0, x0)
-        try:
-            cost = cost_within_domain(controller.problem, controller.rollout(x0, noise=noise))[0]
-        except DivergenceError:
-            cost = torch.full_like(value, torch.inf)
-    i = int(cost.argmax())
-    finite = bool(cost[i].isfinite())
-    return Corner(len(x0), x0[i].tolist(), float(cost[i]) if finite else None, float(value[i]))
+    return _dearest(x0, *_cost_and_value(controller, x0, noise))

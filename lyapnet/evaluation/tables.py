@@ -69,10 +69,13 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
         )
     for name, found in result.get("constraints", {}).items():
         table.add_row(f"{name}: greatest h, when", f"{found['worst']:.4g}, {found['time']:.4g} s")
-    if corner := result.get("worst_corner"):  # since version 0.3
-        cost = "not finite" if corner["cost"] is None else f"{corner['cost']:.4g}"
-        what = "J − M of one path" if "noise" in result else "cost J"
-        table.add_row(f"dearest of {corner['count']} corners of X₀: {what}, V(0, x₀)", f"{cost}, {corner['value']:.4g}")
+    what = "J − M of one path" if "noise" in result else "cost J"
+    for key, states in {"worst_corner": "corners of X₀", "worst_found": "states near the worst"}.items():
+        if dearest := result.get(key):
+            cost = "not finite" if dearest["cost"] is None else f"{dearest['cost']:.4g}"
+            table.add_row(
+                f"dearest of {dearest['count']} {states}: {what}, V(0, x₀)", f"{cost}, {dearest['value']:.4g}"
+            )
     table.caption = _caption([result])
     return table
 

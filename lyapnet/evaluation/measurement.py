@@ -41,7 +41,7 @@ class Dearest(NamedTuple):
 
     count: int  # number of tested states
     x0: list[float]
-    cost: float | None  # J; None if a closed loop from there is not finite
+    cost: float | None  # J; None if one of these closed loops is not finite
     value: float  # V(0, x₀)
 
 
@@ -272,7 +272,7 @@ def _dearest_near_worst(controller: Controller, table: StateTable, seed: int) ->
     def excesses_from(x0: State) -> PerState:
         cost, value = _cost_and_value(controller, x0)
         tested.append((x0, cost, value))
-        return excess(cost, value, has_goal)
+        return excess(cost, value, has_goal, table.cost)
 
     excesses, generator = excess(table.cost, table.value, has_goal), stream(seed, TEST, SEARCH)
     search_near_worst(controller.initial_states, table.x0, excesses, excesses_from, generator)

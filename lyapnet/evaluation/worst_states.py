@@ -17,9 +17,21 @@ STATES_NEAR_EACH = 16  # random states near each of them
 SPREAD = 0.03  # standard deviation of these states about it, relative to the width of X₀
 
 
-def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
-    """The excess (J_N − V(0, x₀)) / V(0, x₀) of the cost over V; without a goal, relative to the spread of J_N."""
-    return (cost - value) / (value_floored(value, cost) if has_goal else spread(cost))
+def excess(cost: PerState, value: PerState, has_goal: bool = True, typical: Tensor | None = None) -> PerState:
+    """The excess (J_N − V(0, x₀)) / V(0, x₀) of the cost over V, infinite where a closed loop is not finite.
+
+    V is at least a share of the median of typical costs. Without a goal the excess is relative to their spread.
+
+    Args:
+        typical: costs (k,) from random states; None: `cost`.
+    """
+    typical = cost if typical is None else typical
+    typical = typical[typical.isfinite()]
+    if not len(typical):
+        return torch.full_like(cost, torch.inf)
+    return ((cost - value) / (value_floored(value, typical) if has_goal else spread(typical))).nan_to_num(
+        torch.inf, torch.inf
+    )
 
 
 def search_near_worst(

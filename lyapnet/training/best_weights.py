@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from lyapnet.task.cost import spread
-from lyapnet.training.curves import members_of
+from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner, number_over_processes
 
 RATE_DIVISOR = 3.0  # each return divides the learning rate by this
@@ -70,12 +70,17 @@ class ReturnToBest(Callback):
             self.on_validation_end(trainer, pl_module)  # the initial V
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        for member, group in zip(members_of(pl_module), trainer.optimizers[0].param_groups, strict=True):
-            if member.measured_at == trainer.global_step:  # its training had not ended earlier
-                self._compare(trainer, member, group)
+        groups, states = trainer.optimizers[0].param_groups, data_of(trainer).of_each
+        for member, group, data in zip(members_of(pl_module), groups, states, strict=True):
+            if member.measured_at == trainer.global_step and self._compare(trainer, member, group):
+                data.lost = data.lost[:0]  # they are those of the weights that it has left
 
-    def _compare(self, trainer: Trainer, member: Learner, group: dict[str, Any]) -> None:
-        """Compare a member with its best weights, and keep or restore them."""
+    def _compare(self, trainer: Trainer, member: Learner, group: dict[str, Any]) -> bool:
+        """Compare a member, whose training had not ended earlier, with its best weights, and keep or restore them.
+
+        Returns:
+            Whether they are restored.
+        """
         assert member.validation is not None
         step, best = trainer.global_step, self.best[member.label]
         loss, cost, cheapest, spread_of_costs = (
@@ -86,18 +91,20 @@ class ReturnToBest(Callback):
             best.weights = {name: value.clone() for name, value in member.V.state_dict().items()}
             states = (trainer.optimizers[0].state.get(p, {}) for p in group["params"])
             best.optimizer = [_copy_of(state) for state in states]
-            return
+            return False
         sizes = (best.cost, best.cheapest) if member.problem.has_goal else (spread_of_costs, spread_of_costs)
         diverges = cheapest - best.cheapest > (DIVERGENCE_COST_RATIO - 1) * sizes[1]
         if not (diverges or cost - best.cost > WORSE_BY * sizes[0]):
             best.worse_since = None
-            return
+            return False
         best.worse_since = step if best.worse_since is None else best.worse_since
         ends = step >= (member.cooling[1] if member.cooling else trainer.max_epochs or math.inf)
-        if ends or diverges or (self.returns_if_worse and step - best.worse_since >= WORSE_FOR):
-            self._return(
-                trainer, member, group, f"cost {cost:.4g} at step {step}, {best.cost:.4g} at step {best.step}", ends
-            )
+        if not (ends or diverges or (self.returns_if_worse and step - best.worse_since >= WORSE_FOR)):
+            return False
+        self._return(
+            trainer, member, group, f"cost {cost:.4g} at step {step}, {best.cost:.4g} at step {best.step}", ends
+        )
+        return True
 
     def _return(self, trainer: Trainer, member: Learner, group: dict[str, Any], because: str, ends: bool) -> None:
         """Restore the best weights of a member."""

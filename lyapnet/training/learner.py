@@ -152,8 +152,10 @@ class Learner(nn.Module):
 
     @property
     def selection_loss(self) -> float:
-        """The loss of which the least chooses the best weights: the validation loss and, if it contains the relative
-        cost, the excess of the worst lost state that was found, as if it were one more validation state.
+        """The loss of which the least chooses the best weights.
+
+        It is the validation loss and, if that contains the relative cost, `lost_excess` divided by the number of
+        validation states, about as if the worst state that was found were one of them.
         """
         assert self.validation is not None
         weight = self.program.trajectory_cost if self.program.normalise and self.region_share is None else 0.0

@@ -62,7 +62,7 @@ class TrainingModule(L.LightningModule):
         draw = (POINTS, self.global_rank, self.global_step)
 
         def train(member: Learner, states: Tensor) -> Tensor | None:
-            if self._has_ended(member, self.global_step):
+            if self.has_ended(member, self.global_step):
                 member.output = None
                 return None
             return member.train_on(member.roll_out(states, TRAINING, *draw[1:]), draw)
@@ -81,14 +81,14 @@ class TrainingModule(L.LightningModule):
         """
 
         def validate(member: Learner, states: Tensor) -> Tensor:
-            if self._has_ended(member, member.measured_at):
+            if self.has_ended(member, member.measured_at):
                 return states.new_tensor(member.validation_loss)
             member.measured_at = self.global_step
             return member.measure_on(member.roll_out(states, VALIDATION))
 
         return self.without_gradient(x0, validate)
 
-    def _has_ended(self, member: Learner, step: int) -> bool:
+    def has_ended(self, member: Learner, step: int) -> bool:
         """Whether a member's training has ended before a step; no for processes that train together, which wait for a
         gradient of each member.
         """

@@ -395,8 +395,8 @@ def fit(
         for further in examples_beyond(learner, optimum, path, beyond, searching):
             examples = examples.concatenated_with(further)
     learner.V.load_state_dict(best)
-    lost, cost = -1 - least[0], least[1]
-    return Fit(math.inf if lost else (cost - float(optimum.path.cost.mean())) / size, gain_of_other)
+    finite, cost = -least[0], least[1]
+    return Fit((cost - float(optimum.path.cost.mean())) / size if finite == 1 else math.inf, gain_of_other)
 
 
 def looks_ahead(learner: Learner) -> bool:

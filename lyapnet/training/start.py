@@ -19,6 +19,7 @@ from lyapnet.training.initial_networks import network_of, raise_to_costs, start_
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
 from lyapnet.training.pretraining import (
+    MIN_OPTIMA,
     Examples,
     Fit,
     draw_examples,
@@ -126,7 +127,8 @@ def choose_start(
             if math.isfinite(chosen.cost) and chosen.cost:
                 network.scale.fill_(abs(chosen.cost))
     policy, gain_ahead = learners[0].rollout.closed_loop.policy, fitted.gain_of_another_law
-    if seeks_optima and type(policy) is SampledPolicy and fitted.excess > MIN_LOOKAHEAD_GAIN:  # no law saves more
+    may_save = gain_ahead > 0 or fitted.excess > MIN_LOOKAHEAD_GAIN  # no law saves more than this excess
+    if seeks_optima and type(policy) is SampledPolicy and may_save:
         report("closed loops of the law that looks ahead")
         gain_ahead = gain_ahead or _gain_by_looking_ahead(policy, x0[:TEST_STATES])
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
@@ -238,7 +240,8 @@ def _fit_to_optima(
         may_look_ahead: whether a fit may end early because the lookahead law of its V costs much less.
 
     Returns:
-        The optimal trajectories, None if there are none; and how the fits ended: the largest excess, the least gain.
+        The optimal trajectories, None if there are none; and how the fits ended: the largest excess, infinite
+        if the fitted networks are not kept or few optima are known, and the least gain.
     """
     problem, x0, report = learners[0].problem, trials.x0, trials.report
     before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
@@ -275,11 +278,13 @@ def _fit_to_optima(
 
         fits.append(fit(learner, optimum, examples, report, gain_by_looking_ahead))
     fitted = trials.roll_out(name)
-    if _cheapest([*rivals, fitted]) != fitted:
+    is_best = _cheapest([*rivals, fitted]) == fitted
+    if not is_best:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
     excess, gain = zip(*fits, strict=True)
-    return optimum, Fit(max(excess), min(gain))
+    is_known = is_best and found >= min(MIN_OPTIMA, len(solutions.path.cost))
+    return optimum, Fit(max(excess) if is_known else math.inf, min(gain))
 
 
 def _reason_for_no_optimum(solutions: Optimum) -> Missing:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.task.problem import Problem
-from lyapnet.training import best_weights
+from lyapnet.training import best_weights, lost_states
 from lyapnet.training.best_weights import COMPARED_SHARE, DIVERGENCE_COST_RATIO, RATE_DIVISOR, WORSE_BY
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
@@ -44,7 +44,8 @@ class Validations:
         costs = own if isinstance(own, torch.Tensor) else torch.full((STATES,), float(own))
         learner.validation = replace(learner.validation, cost=costs, value=self.values(STATES))
         learner.validation_loss = self.loss(float(costs.mean()))
-        learner.lost_excess = float(self.excesses[step // 2])
+        if self.excesses is not None:
+            learner.lost_excess = float(self.excesses[step // 2])
         self.weights[step] = {name: value.clone() for name, value in learner.V.state_dict().items()}
         return torch.tensor(learner.validation_loss)
 
@@ -103,6 +104,20 @@ def test_a_lost_state_counts_as_one_more_validation_state(excess, best, config, 
     seen = Validations(monkeypatch, [3, 2, 2.2, 3, 3, 3, 3], excesses=[0, excess, 0, 0, 0, 0, 0])
     run = train(config, console=Console(quiet=True))
     assert same(weights_of(run, "best"), seen.weights[best])
+
+
+@pytest.mark.parametrize(("excess", "best"), [(0.4, 2), (50.0, 4)])
+def test_the_search_at_a_validation_counts_for_its_weights(excess, best, config, monkeypatch):
+    def found(learner, x0, step):
+        return x0.new_zeros(len(x0)), excess if step == 2 else 0.0
+
+    config["training"]["lost_share"] = 0.5
+    monkeypatch.setattr(lost_states, "GRAVE_EXCESS", 0.5)
+    monkeypatch.setattr(lost_states, "_search", found)
+    seen = Validations(monkeypatch, [3, 2, 2.0001, 3, 3, 3, 3], excesses=None)
+    run = train(config, console=Console(quiet=True))
+    assert same(weights_of(run, "best"), seen.weights[best])
+    assert read_checkpoint(run.last)["callbacks"]["LostStates"] == {"": 0.0}
 
 
 @pytest.mark.parametrize("program", [{"normalise": False}, {"trajectory_cost": 0, "constraint": 1}])

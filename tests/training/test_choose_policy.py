@@ -11,7 +11,7 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
-from lyapnet.training.pretraining import Fit
+from lyapnet.training.pretraining import Fit, fit
 from lyapnet.training.start import _gain_by_looking_ahead, choose_start
 from lyapnet.value.expansions import riccati
 from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
@@ -40,6 +40,7 @@ def brief(monkeypatch, tmp_path):
     """The task, its log folder, and a search for a start that is brief and finds that looking ahead gains a fifth."""
     monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 60, 20)
+    monkeypatch.setattr("lyapnet.training.start.fit", lambda *given: fit(*given)._replace(excess=0.2))
     monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: 0.2)
     return {**TASK, "logs": str(tmp_path)}
 
@@ -112,6 +113,7 @@ def test_a_law_close_to_the_optima_has_nothing_to_save(excess, asked, monkeypatc
     calls = list[torch.Tensor]()
     monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 6)
     monkeypatch.setattr("lyapnet.training.start.fit", lambda *_: Fit(excess, 0.0))
+    monkeypatch.setattr("lyapnet.training.start._cheapest", lambda candidates: candidates[-1])  # the fitted V
     monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: calls.append(x0) or 0.01)
     config = config_from_plain(TASK, FEW)
     choose_start([build_learner(config, build_problem(config))])

@@ -104,6 +104,24 @@ def test_a_search_near_the_worst_states_finds_what_is_rare():
     assert ((further[:, 0] - 0.3).abs() < 0.1 + 10 * SPREAD).all(), "and near the worst"
 
 
+def test_excesses_near_the_worst_are_relative_to_random_costs():
+    cost, value = torch.linspace(0.0, 2.0, 101), torch.zeros(101)
+    near = torch.tensor([2.0, 2.001])
+    assert excess(near, near - 0.1, False, cost).tolist() == pytest.approx([0.1 / float(cost.std(correction=0))] * 2)
+    assert excess(near, near - 0.1, False).min() > 1, "the counterpart: relative to each other"
+    floored = excess(near, torch.zeros(2), True, cost)
+    assert floored.tolist() == pytest.approx([2.0 / 0.05, 2.001 / 0.05])
+    assert excess(cost, value)[-1] == floored[0]
+
+
+def test_a_loop_that_is_not_finite_has_an_infinite_excess_and_the_others_their_own():
+    cost = torch.tensor([torch.inf, 1.0, 1.0, 1.2])
+    for has_goal, size in ((True, 1.0), (False, float(cost[1:].std(correction=0)))):
+        expected = [torch.inf, 0.0, 0.0, 0.2 / size]
+        assert excess(cost, torch.ones(4), has_goal).tolist() == pytest.approx(expected)
+    assert excess(cost[:1], torch.ones(1)).tolist() == [torch.inf]
+
+
 def test_without_lost_states_nothing_more_is_tested():
     x0 = PROBLEM.initial_states.sample(8, torch.Generator().manual_seed(0))
     mild = torch.full((8,), 0.99 * MIN_EXCESS)
@@ -176,7 +194,7 @@ def _diverges():
     def diverging(learner, trajectory):
         raise DivergenceError("Expected a finite closed loop, got none.")
 
-    lost_states._excess_of = diverging
+    lost_states._cost_and_value = diverging
 
 
 @pytest.mark.parametrize("seeds", sample([1, 2], 2))

@@ -56,8 +56,8 @@ def terminal_hinge(values: ValuePath, terminal_cost: PerState) -> PerState:
     return torch.relu(terminal_cost - values[-1])
 
 
-def value_floored(value: PerState, cost: PerState) -> PerState:
-    """V(0, x₀), at least MIN_COST_SHARE of the median cost, as the denominator of relative costs."""
+def value_floored(value: PerState, cost: Tensor) -> PerState:
+    """V(0, x₀), at least MIN_COST_SHARE of the median of costs (k,), as the denominator of relative costs."""
     return value.maximum(MIN_COST_SHARE * cost.median())
 
 

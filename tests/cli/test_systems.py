@@ -60,6 +60,15 @@ def test_code_of_the_users_own_that_leaves_is_named(monkeypatch, capsys):
     assert "Expected code of your own that returns, got SystemExit: 3" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("imported", "searched"), [("lyapnet.base", "garbage"), ("lyapnet.cli", "")])
+def test_a_command_ends_without_a_last_search_for_garbage(imported, searched):
+    code = f"import {imported}\nclass Cycle:\n    def __del__(self): print('garbage')\nx = Cycle()\nx.x = x\ndel x"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+        == searched
+    )
+
+
 def test_commands_seldom_search_for_garbage_and_leave_that_as_it_was(monkeypatch):
     before, seen = gc.get_threshold(), []
     monkeypatch.setattr(cli, "app", lambda *_, **__: seen.append(gc.get_threshold()[0]))

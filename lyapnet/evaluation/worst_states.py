@@ -11,7 +11,7 @@ from lyapnet.task.cost import spread
 from lyapnet.task.sets import Box
 
 MIN_EXCESS = 0.05  # relative excess of the cost over V(0, x₀) above which a state counts as lost
-ROUNDS = 4  # searches near the states with the largest excess
+ROUNDS = 6  # searches near the states with the largest excess
 WORST_STATES = 16  # number of these states
 STATES_NEAR_EACH = 16  # random states near each of them
 SPREAD = 0.03  # standard deviation of these states about it, relative to the width of X₀

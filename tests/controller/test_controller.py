@@ -229,8 +229,8 @@ def test_evaluation_has_the_designed_keys(controller):
     result = evaluate(controller, samples=5, seed=2)
     assert result.keys() >= DESIGNED_KEYS
     assert (result["samples"], result["seed"]) == (5, 2)
-    errors, corner = result.pop("terminal_errors"), result.pop("worst_corner")
-    assert corner.keys() == {"count", "x0", "cost", "value"}
+    errors, corner, found = (result.pop(key) for key in ("terminal_errors", "worst_corner", "worst_found"))
+    assert corner.keys() == found.keys() == {"count", "x0", "cost", "value"}
     assert errors.keys() == {"position (m)", "velocity (m/s)"}
     assert result["optimum_of"] == "steps of 0.01 s (euler) with u held"
     assert result["after_T"] in LAWS

@@ -223,11 +223,11 @@ def _evaluation_on_model(
     cost, left = cost_within_domain(controller.problem, trajectory)
     table = dataclasses.replace(table, cost=cost, left=left)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
-    corner, problem = dearest_corner(controller), controller.problem
+    problem, corner = controller.problem, dearest_corner(controller)
+    found = _dearest_near_worst(controller, first, seed)
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
     later = share_at_goal(controller, first.x0[:LOOPS]), controller.law.beyond
-    further = (seed, problem, corner, _dearest_near_worst(controller, first, seed), held)
-    further = (*further, costs_of_lqr(problem, first.x0), *later)
+    further = (seed, problem, corner, found, held, costs_of_lqr(problem, first.x0), *later)
     if not optimum:
         return Evaluation(first, paper, [NOT_ASKED] * samples, *further)
     try:

@@ -29,9 +29,8 @@ def excess(cost: PerState, value: PerState, has_goal: bool = True, typical: Tens
     typical = typical[typical.isfinite()]
     if not len(typical):
         return torch.full_like(cost, torch.inf)
-    return ((cost - value) / (value_floored(value, typical) if has_goal else spread(typical))).nan_to_num(
-        torch.inf, torch.inf
-    )
+    size = value_floored(value, typical) if has_goal else spread(typical)
+    return ((cost - value) / size).nan_to_num(torch.inf, torch.inf)
 
 
 def search_near_worst(

@@ -15,7 +15,7 @@ from lyapnet.training.learner import Learner
 
 SEARCHED_STATES = 512  # random states of X₀ that are tested at each validation
 MAX_LOST_STATES = 256  # most recent lost states kept
-GRAVE_EXCESS = 0.5  # relative excess over V(0, x₀) from which on it counts in the choice of the best weights
+GRAVE_EXCESS = 0.5  # excess above which a lost state counts in the choice of the best weights
 MOST_EXCESS = 1e3  # the largest that counts; also that of closed loops that are not finite
 
 

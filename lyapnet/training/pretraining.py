@@ -74,11 +74,14 @@ def method_for(problem: Problem) -> Method:
     return SMOOTH if problem.has_linear_law and problem.constraints is None else WITH_KINKS
 
 
-class Fit(NamedTuple):
+class FitResult(NamedTuple):
     """How a fit ended."""
 
     excess: float  # mean cost of the fitted law relative to that of the optima, less 1; infinite if a loop is lost
     gain_of_another_law: float  # relative cost that another law of V saves, if that has ended the fit, else 0
+
+
+NOT_FITTED = FitResult(math.inf, 0.0)
 
 
 class Examples(NamedTuple):
@@ -356,7 +359,7 @@ def fit(
     examples: Examples,
     report: StageReport = silent,
     gain_of_another_law: Callable[[], float] = lambda: 0.0,
-) -> Fit:
+) -> FitResult:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
     The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, after PATIENCE
@@ -396,7 +399,7 @@ def fit(
             examples = examples.concatenated_with(further)
     learner.V.load_state_dict(best)
     finite, cost = -least[0], least[1]
-    return Fit((cost - float(optimum.path.cost.mean())) / size if finite == 1 else math.inf, gain_of_other)
+    return FitResult((cost - float(optimum.path.cost.mean())) / size if finite == 1 else math.inf, gain_of_other)
 
 
 def looks_ahead(learner: Learner) -> bool:

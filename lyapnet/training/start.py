@@ -20,8 +20,9 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
 from lyapnet.training.pretraining import (
     MIN_OPTIMA,
+    NOT_FITTED,
     Examples,
-    Fit,
+    FitResult,
     draw_examples,
     fit,
     fit_briefly,
@@ -117,7 +118,7 @@ def choose_start(
         problem, expansions.get(base.name), x0[:TEST_STATES], partial(report, f"improving on {base.name}")
     )
     may_look_ahead = may_look_ahead and not problem.risk  # which that law does not know
-    optimum, fitted = None, Fit(math.inf, 0.0)
+    optimum, fitted = None, NOT_FITTED
     if seeks_optima:
         optimum, fitted = _fit_to_optima(learners, list(expansions.values()), drawn, base, trials, may_look_ahead)
     chosen = _cheapest(trials.tried)
@@ -231,7 +232,7 @@ def _fit_to_optima(
     base: Candidate,
     trials: "_Trials",
     may_look_ahead: bool,
-) -> tuple[Optimum | None, Fit]:
+) -> tuple[Optimum | None, FitResult]:
     """Fit the networks to optimal trajectories.
 
     If the fitted networks are no better than the base candidate, they are restored.
@@ -251,12 +252,12 @@ def _fit_to_optima(
         solutions = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
         trials.leave_out("optima from states of X₀", singular(error))
-        return None, Fit(math.inf, 0.0)
+        return None, NOT_FITTED
     optimum = minima(problem, solutions)
     found = len(optimum.path.cost)
     if not found:
         trials.leave_out("optima from states of X₀", _reason_for_no_optimum(solutions))
-        return None, Fit(math.inf, 0.0)
+        return None, NOT_FITTED
     examples = draw_examples(problem, optimum, stream(0, START, 4), looks_ahead(learners[0]))
     name = f"{found} optima from states of X₀"
     trials.note(name, _describe_replaced_derivatives(optimum))
@@ -266,7 +267,7 @@ def _fit_to_optima(
         rivals.append(trials.roll_out("the regulator, up to where it is right"))
         if _cheapest(rivals) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
-    fits = list[Fit]()
+    fits = list[FitResult]()
     for learner in learners:
         policy = learner.rollout.closed_loop.policy
 
@@ -284,7 +285,7 @@ def _fit_to_optima(
             learner.V.load_state_dict(state)
     excess, gain = zip(*fits, strict=True)
     is_known = is_best and found >= min(MIN_OPTIMA, len(solutions.path.cost))
-    return optimum, Fit(max(excess) if is_known else math.inf, min(gain))
+    return optimum, FitResult(max(excess) if is_known else math.inf, min(gain))
 
 
 def _reason_for_no_optimum(solutions: Optimum) -> Missing:

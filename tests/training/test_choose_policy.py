@@ -11,7 +11,7 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
-from lyapnet.training.pretraining import Fit, fit
+from lyapnet.training.pretraining import FitResult, fit
 from lyapnet.training.start import _gain_by_looking_ahead, choose_start
 from lyapnet.value.expansions import riccati
 from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
@@ -112,7 +112,7 @@ def test_the_same_v_under_the_law_that_looks_ahead():
 def test_a_law_close_to_the_optima_has_nothing_to_save(excess, asked, monkeypatch):
     calls = list[torch.Tensor]()
     monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 6)
-    monkeypatch.setattr("lyapnet.training.start.fit", lambda *_: Fit(excess, 0.0))
+    monkeypatch.setattr("lyapnet.training.start.fit", lambda *_: FitResult(excess, 0.0))
     monkeypatch.setattr("lyapnet.training.start._cheapest", lambda candidates: candidates[-1])  # the fitted V
     monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: calls.append(x0) or 0.01)
     config = config_from_plain(TASK, FEW)

@@ -1,13 +1,15 @@
-"""Early stopping: ends a training whose validation loss has stopped falling."""
+"""Early stopping: ends a training for which further steps bring nothing."""
 
 import math
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.experiment.config import Config
+from lyapnet.loop.programs import ValueProgram
 from lyapnet.training.curves import members_of
 from lyapnet.training.learner import Learner, number_over_processes
 from lyapnet.training.stage_messages import StageMessages
@@ -19,9 +21,11 @@ PATIENCE = 120  # steps without a lower loss after which even an oscillating los
 
 
 class Settling(Callback):
-    """Decays a member's learning rate over COOLING steps once its validation loss has stopped falling; then ends.
+    """Decays a member's learning rate over COOLING steps once further steps bring nothing; then ends.
 
-    The loss has stopped falling if both hold:
+    With the value program they bring nothing if the mean cost of the validation states, where the optimum is known, is
+    within `least_gain` of it and no state is lost, as after many fits to optima. Otherwise they do if the validation
+    loss has stopped falling, that is, if both hold:
 
     1. Its least value in the last WINDOW steps is less than `least_gain` below its least value before. The warmup does
        not count.
@@ -57,29 +61,51 @@ class Settling(Callback):
         self._set_last_step(trainer, members_of(pl_module))
         if self.least_gain and trainer.global_step == 0:  # the initial V is validated already
             self._note_losses(0, pl_module)
+            self._end_settled(trainer, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        step, members = trainer.global_step, members_of(pl_module)
-        if not self.least_gain or step < self.warmup:
+        if not self.least_gain:
             return
-        self._note_losses(step, pl_module)
-        for member in members:
-            end, last = step + COOLING, trainer.max_epochs or math.inf
-            if member.cooling is None and end < last and self._has_stopped(member.label, step):
-                self.cooling[member.label] = member.cooling = step, end
-                self._set_last_step(trainer, members)
-                if trainer.is_global_zero:
-                    named = f" of {member.label.replace('_', ' ')}" if member.label else ""
-                    self.stages.console.print(
-                        f"settled: in {WINDOW} steps the validation loss{named} fell by less than "
-                        f"{self.least_gain:g}; its training ends at step {end}",
-                        soft_wrap=True,
-                    )
+        if trainer.global_step >= self.warmup:
+            self._note_losses(trainer.global_step, pl_module)
+        self._end_settled(trainer, pl_module)
 
     def _note_losses(self, step: int, module: LightningModule) -> None:
         for member in members_of(module):
             loss = number_over_processes(member.validation_loss, module.device)
             self.losses.setdefault(member.label, []).append((step, loss))
+
+    def _end_settled(self, trainer: Trainer, module: LightningModule) -> None:
+        """Begin the final decay of the members for which further steps bring nothing."""
+        step, members = trainer.global_step, members_of(module)
+        end, last = step + COOLING, trainer.max_epochs or math.inf
+        for member in members:
+            if member.cooling is not None or end >= last:
+                continue
+            named = f" of {member.label.replace('_', ' ')}" if member.label else ""
+            if self._is_optimal(member, module.device):
+                reason = f"the law{named} costs less than {self.least_gain:.2%} more than the optimum"
+            elif step >= self.warmup and self._has_stopped(member.label, step):
+                reason = f"in {WINDOW} steps the validation loss{named} fell by less than {self.least_gain:g}"
+            else:
+                continue
+            self.cooling[member.label] = member.cooling = step, end
+            self._set_last_step(trainer, members)
+            if trainer.is_global_zero:
+                self.stages.console.print(f"settled: {reason}; its training ends at step {end}", soft_wrap=True)
+
+    def _is_optimal(self, member: Learner, device: torch.device) -> bool:
+        """Whether the cost can fall by less than `least_gain`, relative to the optimum, and nothing else is trained.
+
+        Each process has its own validation states; with unknown optima in one of them the answer is no.
+        """
+        if not isinstance(member.program, ValueProgram) or member.pointwise is not None:
+            return False
+        assert member.validation is not None
+        known = member.validation.against_optimum()
+        ratio, lost = known["cost_ratio"], known.get("lost_fraction") or member.lost_excess
+        excess = math.inf if ratio is None or lost else ratio - 1
+        return number_over_processes(excess, device) < self.least_gain
 
     def _has_stopped(self, label: str, step: int) -> bool:
         losses = self.losses[label]

@@ -5,10 +5,13 @@ import math
 from functools import partial
 
 import pytest
+import torch
 from rich.console import Console
 
+from lyapnet.evaluation.states import StateTable
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.experiment.config import config_from_plain
+from lyapnet.loop.programs import LyapunovProgram
 from lyapnet.training.build import build_module
 from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
@@ -16,8 +19,6 @@ from lyapnet.training.runs import TrainingRun
 from lyapnet.training.settling import COOLING, WINDOW, Settling, end_of
 from lyapnet.training.stage_messages import StageMessages
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, without_figures
-
-pytestmark = pytest.mark.gate
 
 EVERY = 20
 LONG = {
@@ -85,6 +86,46 @@ def test_the_loss_of_the_start_counts_once_patience_is_out(losses, stopped):
     assert has_stopped(losses, warmup=2 * EVERY) is stopped
 
 
+OPTIMA, UNKNOWN = [1.0, 2.0, math.nan], [math.nan] * 3
+
+
+@pytest.mark.parametrize(
+    ("cost", "optima", "changes", "optimal"),
+    [
+        ([1.0005, 2.0005, 9.0], OPTIMA, {}, True),
+        ([1.002, 2.002, 3.0], OPTIMA, {}, False),
+        ([1.1, 1.9, 3.0], OPTIMA, {}, False),  # one state is lost, though the mean is right
+        ([1.0005, 2.0005, 9.0], OPTIMA, {"lost_excess": 3.0}, False),
+        ([1.0, 2.0, 3.0], UNKNOWN, {}, False),
+        ([1.0, 2.0, 3.0], None, {}, False),
+        ([1.0005, 2.0005, 9.0], OPTIMA, {"program": LyapunovProgram()}, False),  # which trains its condition too
+    ],
+)
+def test_a_law_at_the_optimum_has_settled(cost, optima, changes, optimal):
+    (member,) = build_module(config_from_plain({**SMALL, "program": {"name": "value"}})).members
+    x, costs = torch.ones(3, 2), torch.tensor(cost)
+    known = None if optima is None else torch.tensor(optima)
+    member.validation = StateTable(x, costs, costs, known, costs, costs, costs > 0, costs > 0, costs, x, costs)
+    for name, value in changes.items():
+        setattr(member, name, value)
+    assert Settling(1e-3, 0, StageMessages(Console(), ""))._is_optimal(member, torch.device("cpu")) is optimal
+
+
+@pytest.mark.gate
+def test_a_training_that_starts_at_the_optimum_is_short(tmp_path):
+    changes = {
+        "program": {"name": "value", "constraint": 0, "cost_to_go": 10, "trajectory_cost": 1},
+        "network": {"name": "expansion", "hidden": [8]},  # starts from the Riccati solution
+        "rollout": {**LONG["rollout"], "policy": "sampled"},
+        "training": {**LONG["training"], "least_gain": 1e-3, "warmup": 40},
+        "evaluation": {**LONG["evaluation"], "optimum": True},
+    }
+    one, out = trained(tmp_path / "optimal", **changes)
+    assert f"settled: the law costs less than 0.10% more than the optimum; its training ends at step {COOLING}" in out
+    assert checkpoint(one, "last")["global_step"] == COOLING
+
+
+@pytest.mark.gate
 def test_the_start_is_among_the_losses(run):
     losses = checkpoint(run[0], "last")["callbacks"]["Settling"]["losses"]
     (kept,) = losses.values()
@@ -108,6 +149,7 @@ def test_it_ends_with_the_last_seed():
     assert end_of({"seed_0": (60, 100)}, 2) == math.inf
 
 
+@pytest.mark.gate
 def test_training_ends_early_and_says_so(run):
     one, out = run
     ends = f"the validation loss fell by less than 1e+06; its training ends at step {END}"
@@ -117,12 +159,14 @@ def test_training_ends_early_and_says_so(run):
     assert TrainingRun(one.run).finished
 
 
+@pytest.mark.gate
 def test_without_a_least_gain_it_takes_all_steps(tmp_path):
     one, out = trained(tmp_path / "whole", training={**LONG["training"], "iterations": END + 5, "least_gain": 0})
     assert "settled" not in out
     assert checkpoint(one, "last")["global_step"] == END + 5
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("step", [SETTLED_AT + 5, END])
 def test_a_settled_training_resumes_to_the_same_end(run, step, tmp_path):
     other = desk(tmp_path / "other")
@@ -134,6 +178,7 @@ def test_a_settled_training_resumes_to_the_same_end(run, step, tmp_path):
     assert [*differences(checkpoint(run[0], "last"), checkpoint(other, "last"))] == []
 
 
+@pytest.mark.gate
 def test_a_settled_run_is_finished_until_all_steps_are_asked_for(run, tmp_path):
     one = run[0].copy(tmp_path / "copy")
     status, out, _ = one.train("--resume", "last", prepare=without_figures)
@@ -145,8 +190,8 @@ def test_a_settled_run_is_finished_until_all_steps_are_asked_for(run, tmp_path):
 
 
 def settles_at(step):
-    """Have the first seed settle at its first chance, and others at a step."""
-    Settling._has_stopped = lambda self, label, now: label in ("", "seed_0") or now >= step
+    """Have the first seed settle at the first validation after the start, and others at a step."""
+    Settling._has_stopped = lambda self, label, now: now > 0 and (label in ("", "seed_0") or now >= step)
 
 
 def count_rollouts(path):
@@ -161,6 +206,7 @@ def count_rollouts(path):
     Learner.train_on = counted
 
 
+@pytest.mark.gate
 def test_a_seed_that_has_settled_costs_no_more_rollouts(tmp_path):
     two, counts = desk(tmp_path, seeds=2), tmp_path / "counts"
     first = partial(both, partial(both, without_figures, partial(settles_at, 40)), partial(count_rollouts, counts))
@@ -191,6 +237,7 @@ def test_other_weights_are_measured_again():
     assert member.measured_at == -1
 
 
+@pytest.mark.gate
 def test_a_seed_that_has_settled_waits_for_the_others(tmp_path):
     first = partial(both, without_figures, partial(settles_at, 40))
     alone = desk(tmp_path / "alone")

@@ -71,7 +71,9 @@ def gradient(
 
     All routes of one task and batch are warmed up, then timed in turns.
     Memory is the peak beyond the model; errors are relative, against
-    backprop in float64. Compiled is by lyapnet's kernel on a CPU, and by
+    backprop in float64. % of peak: multiply-adds of V and V_x at each step,
+    three times for a gradient, per second, beside those in products of
+    large matrices. Compiled is by lyapnet's kernel on a CPU, and by
     CUDA graphs on a GPU; rollout.compile=off leaves it out.
 
     lyapnet bench --task double_integrator,reacher --batch 12,64 --json

@@ -14,6 +14,7 @@ from torch.profiler import ProfilerActivity, profile
 from lyapnet.base import threads as base_threads
 from lyapnet.base.types import State
 from lyapnet.lab.bench.accuracy import reference_gradient, relative_error
+from lyapnet.lab.bench.arithmetic import GRADIENT_FACTOR, multiply_adds, peak_rate
 from lyapnet.lab.bench.cases import Case
 from lyapnet.lab.bench.routes import JAX_ROUTES, entries, timed
 
@@ -32,6 +33,7 @@ class BenchRow:
     steps_per_second: float  # environment steps: batch · N / seconds
     peak_bytes: int | None  # beyond the model; None: not torch's memory
     relative_error: float | None  # ‖gradient − reference‖ / ‖reference‖; None: no gradient
+    peak_share: float  # multiply-adds per second that V and V_x need, and their gradient, relative to `peak_rate`
     compile_seconds: float | None  # to trace, and to compile or load from disk; None: nothing is compiled
 
 
@@ -53,13 +55,15 @@ def time_routes(
     errors = _errors(gradients, case, x0)
     peaks = [None if entry.route in JAX_ROUTES else peak_bytes(entry.run) for entry in ready]
     turns = [[timed(entry.run)[1] for entry in ready] for _ in range(repeats)]
+    least = batch * multiply_adds(case) / peak_rate(x0.dtype)  # seconds at the machine's peak
     rows = []
     for entry, error, peak, times in zip(ready, errors, peaks, zip(*turns, strict=True), strict=True):
         seconds = statistics.median(times)
         rows.append(
             BenchRow(
                 case.name, case.problem.system.n, batch, entry.route, entry.compiled, case.config.training.precision,
-                seconds, batch * case.problem.horizon.steps / seconds, peak, error, entry.compile_seconds,
+                seconds, batch * case.problem.horizon.steps / seconds, peak, error,
+                (GRADIENT_FACTOR if entry.flat else 1) * least / seconds, entry.compile_seconds,
             )
         )  # fmt: skip
     return rows

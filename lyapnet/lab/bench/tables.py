@@ -16,19 +16,19 @@ from lyapnet.lab.bench.tightness import Tightness
 def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
     """Time, memory and error of each route for one task."""
     parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.problem.horizon
-    columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
+    columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "% of\npeak", "MB", "error")]
     table = Table("route", "com-\npiled", *columns)
     table.title = (
         f"{case.name}: one loss and its gradient\n{horizon.steps} steps, {parameters} parameters, "
         f"{rows[0].dtype}, {threads} thread{'s' * (threads > 1)}, median of {repeats}"
     )
-    table.caption = f"×: times faster than {BASELINE}; steps: of the environment; MB: peak"
+    table.caption = f"×: times faster than {BASELINE}; % of peak: of multiply-adds per second; MB: most memory"
     baseline = {row.batch: row.seconds for row in rows if row.route == BASELINE}
     for row, following in zip(rows, [*rows[1:], None], strict=True):
         table.add_row(
             row.route, "yes" if row.compiled else "no", str(row.batch), f"{row.seconds:.3g}",
             f"{baseline[row.batch] / row.seconds:.2g}" if row.batch in baseline else "–",
-            f"{row.steps_per_second / 1e3:,.1f}",
+            f"{100 * row.peak_share:.2g}",
             "–" if row.peak_bytes is None else f"{row.peak_bytes / 1e6:.1f}",
             "–" if row.relative_error is None else f"{row.relative_error:.0e}",
             end_section=following is not None and following.batch != row.batch,

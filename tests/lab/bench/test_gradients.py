@@ -11,6 +11,7 @@ from lyapnet.base.errors import CompilationError
 from lyapnet.graphs.compilation import has_compiler
 from lyapnet.lab import bench
 from lyapnet.lab.bench.accuracy import reference_gradient, relative_error
+from lyapnet.lab.bench.arithmetic import multiply_adds
 from lyapnet.lab.bench.cases import flat
 from lyapnet.lab.bench.measurement import peak_bytes
 
@@ -61,7 +62,7 @@ def test_json_is_a_list_of_objects_with_these_fields(rows_of):
     assert [row["route"] for row in rows] == list(TORCH_ROUTES)
     kinds = {
         "task": str, "states": int, "batch": int, "route": str, "compiled": bool, "dtype": str, "seconds": float,
-        "steps_per_second": float, "peak_bytes": int,
+        "steps_per_second": float, "peak_bytes": int, "peak_share": float,
     }  # fmt: skip
     for row in rows:
         assert row.keys() == {*kinds, "relative_error", "compile_seconds"}
@@ -96,6 +97,13 @@ def test_reference_in_slices_is_the_gradient_of_the_whole_batch(name, monkeypatc
     monkeypatch.setattr("lyapnet.lab.bench.accuracy.SLICE", 3)
     assert relative_error(reference_gradient(case, x0), whole) < 1e-12
     assert relative_error(reference_gradient(case, x0[:6]), whole) > 1e-3
+
+
+@pytest.mark.parametrize(("hidden", "products"), [("8", 3 * 8 + 8), ("8,8", 3 * 8 + 8 * 8 + 8)])
+def test_multiply_adds_of_a_network(hidden, products):
+    """V and V_x at each of 10 steps, with the layers 3-8-1 and 3-8-8-1 for (t, x)."""
+    case = case_of("network.name=fcn", f"network.hidden=[{hidden}]")
+    assert multiply_adds(case) == 10 * 2 * products
 
 
 def test_peak_of_known_tensors():

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import CompilationError, UntraceableError
 from lyapnet.graphs.number_kernel.assembly import is_built
-from lyapnet.training.stage_messages import StageMessages
+from lyapnet.training.stage_messages import StageMessages, StageReport
 
 
 class Compilation(Callback):
@@ -25,15 +25,15 @@ class Compilation(Callback):
         self.stages, self.batch_size, self.record = stages, batch_size, record
         self._compiled_on: str | None = None  # type of the device, such as "cpu"
 
-    def before_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def before_start(self, trainer: Trainer, pl_module: LightningModule, report: StageReport) -> None:
         """Compile for the search of the initial V, which always runs on the CPU."""
-        self._compile(trainer, pl_module)
+        self._compile(trainer, pl_module, report)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._compiled_on != pl_module.device.type:
-            self._compile(trainer, pl_module)
+            self._compile(trainer, pl_module, self.stages)
 
-    def _compile(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def _compile(self, trainer: Trainer, pl_module: LightningModule, report: StageReport) -> None:
         module: Any = pl_module
         self._compiled_on = module.device.type
         started = time.perf_counter()
@@ -41,7 +41,7 @@ class Compilation(Callback):
             fresh = (
                 "" if is_built(torch.get_default_dtype()) else " and compiling lyapnet's kernel, once for this machine"
             )
-            self.stages(f"tracing the closed loop and its gradient{fresh}")
+            report(f"tracing the closed loop and its gradient{fresh}")
         try:
             module.compile_for(self.batch_size)
         except UntraceableError:  # compile_for has logged the reason; the loop runs uncompiled

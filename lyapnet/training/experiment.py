@@ -182,10 +182,10 @@ def _set_constraint_penalty(plan: Plan, console: Console, is_first_process: bool
 def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | None:
     """Initialise the networks with the best known V, where they can represent it, and report the choice."""
     is_first_process, callbacks = trainer.is_global_zero, trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
-    if has_place_for_start(list(plan.module.members)):
-        for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
-            compilation.before_start(trainer, plan.module)
     with StageMessages(console, "start") if is_first_process else nullcontext(silent) as report:
+        if has_place_for_start(list(plan.module.members)):
+            for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
+                compilation.before_start(trainer, plan.module, report)
         start = load_or_choose_start(
             list(plan.module.members), report, may_look_ahead=plan.config.rollout.choose_policy
         )

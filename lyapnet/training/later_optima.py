@@ -78,7 +78,9 @@ def _solve_from(later: Problem, optimum: Optimum, path: Path, k: int, rows: Tens
     """The optima from x_k of some closed loops over the remaining steps."""
     x, known = path.x[k, rows], Expansion(*(part[k:] for part in optimum.expansion))
     neighbours = nearest(x, optimum.path.x[k])
-    guesses = [follow_expansions(later, known.member(column), x) for column in neighbours.unbind(1)]
+    guesses = [
+        follow_expansions(later, known.member(column), optimum.path.u[k:, column], x) for column in neighbours.unbind(1)
+    ]
     own = path.u[k:, rows]
     guesses.append(path_under(later, lambda n, _: own[n], x))
     return optimal_trajectories(later, x, cheapest(guesses).u, seconds=seconds, softer_first=False)

@@ -156,17 +156,18 @@ def _replace_improved(problem: Problem, optimum: Optimum, rows: Tensor, found: O
 
 def _improve_from_neighbours(exact: Problem, optimum: Optimum, report: StageReport) -> Optimum:
     """Try each optimum from the states around it, and keep what is cheaper."""
-    x0 = optimum.path.x[0]
+    x0, until = optimum.path.x[0], seconds_of_work() + SEARCH_SECONDS
     for k in range(NEIGHBOUR_ROUNDS if len(x0) > 1 else 0):
-        report("optima of neighbours", k, NEIGHBOUR_ROUNDS)
+        report(f"optima of neighbours within {SEARCH_SECONDS:.0f} s of work", k, NEIGHBOUR_ROUNDS)
         paths = [_follow_optimum(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
         best = cheapest(paths)
         improved = torch.nonzero(
             best.cost < optimum.path.cost - (1 - NEIGHBOUR_IMPROVEMENT) * sizes(exact, optimum.path.cost)
         ).flatten()
-        if not len(improved):
+        seconds = until - seconds_of_work()
+        if not len(improved) or seconds < 0:
             break
-        better = optimal_trajectories(exact, x0[improved], best.u[:, improved], softer_first=False)
+        better = optimal_trajectories(exact, x0[improved], best.u[:, improved], seconds=seconds, softer_first=False)
         optimum = _replace_rows(optimum, improved, better)
     return optimum
 
@@ -184,7 +185,7 @@ def _improve_by_other_ways(exact: Problem, optimum: Optimum, report: StageReport
         return optimum
     neighbours = nearest(x0, x0, itself=False, count=WAYS)
     changed, is_first = torch.ones(len(x0), dtype=torch.bool), True
-    while changed.any() and (seconds := until - seconds_of_work()) > 0:
+    while changed.any() and seconds_of_work() < until:
         report(f"optima on other ways within {SEARCH_SECONDS:.0f} s of work")
         rows, controls = list[Tensor](), list[Tensor]()
         for column in neighbours.unbind(1):
@@ -196,7 +197,8 @@ def _improve_by_other_ways(exact: Problem, optimum: Optimum, report: StageReport
             rows.append(to_try[other])
             controls.append(path.u[:, other])
         tried, u = torch.cat(rows), torch.cat(controls, 1)
-        if not len(tried):
+        seconds = until - seconds_of_work()
+        if not len(tried) or seconds < 0:
             break
         if is_first:
             every = max(1, len(tried) // FIRST_WAYS)
@@ -221,7 +223,7 @@ def _path_distance(optimum: Optimum, x: StatePath, other: StatePath) -> PerState
 
 def _follow_optimum(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
     """The paths from some states, each under the local law of one of the optima."""
-    return follow_expansions(exact, optimum.expansion.member(which), x0)
+    return follow_expansions(exact, optimum.expansion.member(which), optimum.path.u[:, which], x0)
 
 
 def nearest(x0: Tensor, others: Tensor, itself: bool = True, count: int = NEIGHBOURS) -> Tensor:

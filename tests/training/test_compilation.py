@@ -114,12 +114,13 @@ def test_a_compilation_that_fails_is_not_on_record(tmp_path, machine_code, capsy
     ("trained_on", "devices", "seen_before_training"), [("cpu", ["cpu"], 1), ("cuda", ["cpu", "cuda"], 0)]
 )
 def test_the_start_is_compiled_for_on_the_cpu_wherever_the_training_runs(trained_on, devices, seen_before_training):
-    compiled, records, device = [], [], torch.device(trained_on)
+    compiled, records, stages, device = [], [], [], torch.device(trained_on)
     module = Mock(spec=LightningModule, device=torch.device("cpu"))
     module.compile_for = lambda size: compiled.append(module.device.type)
     trainer = Mock(spec=Trainer, strategy=SimpleNamespace(root_device=device), is_global_zero=True)
     callback = Compilation(StageMessages(Console(), "training", PATIENCE), 3, lambda **facts: records.append(facts))
-    callback.before_start(trainer, module)
+    callback.before_start(trainer, module, stages.append)
+    assert stages[0].startswith("tracing the closed loop")
     assert len(records) == seen_before_training
     module.device = device
     callback.on_train_start(trainer, module)

@@ -1,5 +1,6 @@
 """Optimal trajectories from many states: what each learns from its neighbours and the oracle."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -152,6 +153,31 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
     monkeypatch.setattr(optima, "OTHER_WAY", math.inf)
     assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
+
+
+@pytest.mark.parametrize("improve", [optima._improve_from_neighbours, optima._improve_by_other_ways])
+def test_later_searches_end_in_their_seconds(improve, monkeypatch, without_oracle):
+    """Each reading of the clock is a second later."""
+    problem, clock, allowed = hanging(steps=20), itertools.count(), []
+    x0 = problem.initial_states.sample(20)
+    optimum = optimal_trajectories(problem, x0, torch.zeros(20, 20, 1), iterations=1)
+
+    def recorded(problem, x0, *arguments, seconds, **options):
+        allowed.append(seconds)
+        return optimal_trajectories(problem, x0, *arguments, **options)
+
+    for name, value in (("OTHER_WAY", -1.0), ("optimal_trajectories", recorded), ("seconds_of_work", clock.__next__)):
+        monkeypatch.setattr(optima, name, value)
+    monkeypatch.setattr(optima, "_path_distance", lambda _, x, other: torch.ones(x.shape[1]))
+    for name in ("NEIGHBOUR_IMPROVEMENT", "OTHER_WAY_IMPROVEMENT"):  # whatever is found counts as cheaper
+        monkeypatch.setattr(optima, name, 3.0)
+    monkeypatch.setattr(optima, "SEARCH_SECONDS", 2.5)
+    improve(problem, optimum, optima.silent)
+    assert all(0 <= seconds < 2.5 for seconds in allowed)
+    few, _ = len(allowed), allowed.clear()
+    monkeypatch.setattr(optima, "SEARCH_SECONDS", 20.5)
+    improve(problem, optimum, optima.silent)
+    assert 0 < few < len(allowed), "the twin: with enough seconds they go on"
 
 
 def test_where_no_way_is_cheaper_few_are_tried(monkeypatch, without_oracle):

@@ -263,19 +263,21 @@ def _widening_of_time(problem: Problem) -> float:
     return max(float(squared_distance(problem.cost, x0).mean().sqrt()), 1.0)
 
 
-def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
+def follow_expansions(problem: Problem, expansion: Expansion, u: ControlPath, x0: State) -> Path:
     """The closed loops from a batch of states, each under the greedy law of its own expansion.
 
     Args:
         problem: in float64, on the CPU.
         expansion: one expansion for each state of x0 (b, n).
+        u: the controls (N, b, m) around which each expansion is; the law of a system that is not control-affine is the
+            local minimum near them.
     """
     if not len(x0):
         return path_under(problem, greedy_law(problem, expansion), x0)
     programs = StepPrograms(problem, STEP_SIZES)
-    path = path_of(problem, *programs.follow(certainty_equivalents(problem, expansion), x0))
+    path = path_of(problem, *programs.follow(certainty_equivalents(problem, expansion), u, x0))
     if not programs.agrees(path) and programs.forget():  # the problem's constants have changed
-        return follow_expansions(problem, expansion, x0)
+        return follow_expansions(problem, expansion, u, x0)
     return path
 
 

@@ -51,7 +51,9 @@ def certainty_equivalents(problem: Problem, expansion: Expansion) -> Expansion:
     return Expansion(x, value, *(torch.cat([part[:1], new]) for part, new in zip((p, H), later, strict=True)))
 
 
-def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
+def held_control(
+    problem: Problem, x: State, free: Response, V_x: State, H: Tensor, near: Control | None = None
+) -> Control:
     """The control held for Δt that minimises ∫ℓ + V(F(x, u)), for V with gradient V_x at F(x, 0) and curvature H.
 
     It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu + s(u) over U, with B = F_u/Δt: without limits and
@@ -63,9 +65,11 @@ def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tens
     Args:
         x: the state at which the step begins.
         free: the step with the control at rest, or for other systems with the nominal one.
+        near: a control at which the search begins for a system that is not control-affine, which then finds the local
+            minimum there; None: the best minimum of a search from several controls.
     """
     if not problem.system.affine:
-        return _control_of_quadratic(problem, x, free, V_x, H)
+        return _control_of_quadratic(problem, x, free, V_x, H, near)
     B = free.by_control
     weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
@@ -75,10 +79,14 @@ def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tens
     return u if free.u is None else u + free.u
 
 
-def _control_of_quadratic(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
+def _control_of_quadratic(
+    problem: Problem, x: State, free: Response, V_x: State, H: Tensor, near: Control | None
+) -> Control:
     """argmin over u ∈ U of `step_objective`."""
     assert free.u is not None
     Q, weight = step_objective(problem, x, free, V_x, H), 2 * problem.cost.R(x)
+    if near is not None:
+        return minimise_over_controls(problem, Q, near[None], weight)
     paid = problem.smooth_rates(x, free.u)[1]
     return minimise_over_controls(problem, Q, starts_of(problem, Q, free.u, paid, weight), weight)
 

@@ -56,9 +56,13 @@ class StepPrograms(StepDerivatives):
         start = _append_zero_cost(x[0]).expand(len(self._search.step_sizes), -1, -1)
         return self._run_loops("search", self._search, [x[:-1], u, k, K], start)
 
-    def follow(self, expansion: Expansion, x0: State) -> tuple[StatePath, ControlPath, PerState]:
-        """Closed loops (x, u, ∫ℓ) from x₀ (b, n), each under the held controls for V from its own expansion."""
-        columns = [expansion.x[1:], expansion.gradient[1:], expansion.hessian[1:]]
+    def follow(self, expansion: Expansion, u: ControlPath, x0: State) -> tuple[StatePath, ControlPath, PerState]:
+        """Closed loops (x, u, ∫ℓ) from x₀ (b, n), each under the held controls for V from its own expansion.
+
+        Args:
+            u: ū (N, b, m), near which the controls of a system that is not control-affine are searched for.
+        """
+        columns = [expansion.x[1:], expansion.gradient[1:], expansion.hessian[1:], u]
         return self._run_loops("follow", _FollowStep(self.problem), columns, _append_zero_cost(x0))
 
     def first(self, z: Tensor) -> list[Tensor]:
@@ -159,17 +163,17 @@ class _SearchStep(nn.Module):
 
 
 class _FollowStep(nn.Module):
-    """(x̄', p', H', y) ↦ (y', y', u), y = (x, ∫ℓ): one step under the held control for V' from an expansion."""
+    """(x̄', p', H', ū, y) ↦ (y', y', u), y = (x, ∫ℓ): one step under the held control for V' from an expansion."""
 
     def __init__(self, problem: Problem):
         super().__init__()
         self.problem = problem
 
     @torch.no_grad()
-    def forward(self, center: State, p: State, H: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
+    def forward(self, center: State, p: State, H: Tensor, near: Control, y: Tensor) -> tuple[Tensor, Tensor, Control]:
         x = y[..., :-1]
         free = self.problem.response(x)
-        u = held_control(self.problem, x, free, p + apply(H, free.x - center), H)
+        u = held_control(self.problem, x, free, p + apply(H, free.x - center), H, near)
         return _advance(self.problem, y, u)
 
 

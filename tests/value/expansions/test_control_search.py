@@ -117,6 +117,17 @@ def test_one_start_alone_misses_some_of_them():
     assert 0 < missed.double().mean() < 1
 
 
+def test_a_control_near_a_given_one_is_a_local_minimum_there():
+    problem = sideways()
+    x, V_x, H = quadratic_ahead(problem)
+    free = problem.response(x)
+    Q, best = step_objective(problem, x, free, V_x, H), held_control(problem, x, free, V_x, H)
+    assert_close(held_control(problem, x, free, V_x, H, near=best), best)
+    near = held_control(problem, x, free, V_x, H, near=free.u)
+    assert (Q(near) <= Q(free.u)).all()
+    assert (Q(near) > Q(best) + 1e-2).any(), "another minimum, which the search from several controls leaves"
+
+
 def test_without_limits_a_start_on_a_hill_is_left():
     """Around u = 0 the slope of ℓ + V_x cos 3u vanishes where it is greatest."""
     problem = sideways(Unbounded())

@@ -80,14 +80,15 @@ def test_each_state_follows_the_law_of_an_expansion_of_its_own(system, kernel, b
     x, p = (torch.randn(N + 1, b, 2, generator=generator, dtype=torch.float64) for _ in range(2))
     root = torch.randn(N + 1, b, 2, 2, generator=generator, dtype=torch.float64)
     expansion = Expansion(x, x[..., 0], p, root @ root.mT)
+    u = torch.zeros(N, b, 1, dtype=torch.float64)
     expected = path_under(problem, greedy_law(problem, expansion), x[0])
-    found = follow_expansions(problem, expansion, x[0])
+    found = follow_expansions(problem, expansion, u, x[0])
     assert programs_of(problem) == {"follow": kernel}
     for mine, other in zip(found, expected, strict=True):
         assert_close(mine, other, rtol=1e-10, atol=1e-10)
     if b > 1:
         turned = expansion.member(torch.arange(b).roll(1))
-        assert not torch.allclose(follow_expansions(problem, turned, x[0]).cost, found.cost), "the twin: of another"
+        assert not torch.allclose(follow_expansions(problem, turned, u, x[0]).cost, found.cost), "the twin: of another"
 
 
 @pytest.mark.parametrize("rows", sample([512, 1, 700], 3))
@@ -162,12 +163,12 @@ def test_a_number_that_changed_is_noticed(what):
     x0, u = torch.tensor([[0.5, 0.0], [-0.3, 0.8]]), torch.zeros(30, 2, 1)
     found = optimal_trajectories(problem, x0, u)
     before = found.path
-    follow_expansions(problem, found.expansion, x0)
+    follow_expansions(problem, found.expansion, found.path.u, x0)
     assert {programs_of(problem)[name] for name in ("search", "follow")} == {ScanKernel}
     assert StepPrograms(problem, SIZES).agrees(before)
     setattr(problem.system if what == "mass" else problem.cost, what, 3.0)
     assert not StepPrograms(problem, SIZES).agrees(before)
-    followed = follow_expansions(problem, found.expansion, x0)
+    followed = follow_expansions(problem, found.expansion, found.path.u, x0)
     assert_close(followed, path_under(problem, greedy_law(problem, found.expansion), x0))
     after = optimal_trajectories(problem, x0, u).path
     assert StepPrograms(problem, SIZES).agrees(after)

@@ -207,7 +207,8 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
     assert len(measured) == 4 * 5
     (names, *tasks), *lines = table_after(PAGES[ROOT / "docs" / "compare.md"], "| cost / J*; at our")
     shown = {(task, line[0]): cell for line in lines for task, cell in zip(tasks, line[1:], strict=True)}
-    assert shown == {key: "; ".join(row[name] for name in names.split("; ")) for key, row in measured.items()}
+    tuned = {key: row for key, row in measured.items() if "paper" not in key[1]}
+    assert shown == {key: "; ".join(row[name] for name in names.split("; ")) for key, row in tuned.items()}
 
 
 @pytest.mark.gate

@@ -24,7 +24,7 @@ def repeated(name: str, repetitions: int, colour: float = 0.0) -> list[Identific
 
 def main(repetitions: int, colour: float, names: list[str]) -> None:
     """Print the table of docs/identify.md."""
-    print("| plant | true p in the 95 % region | in each 95 % interval | half of it | told a wrong model |")
+    print("| plant | true p in the 95 % region | in each 95 % interval | half width | model called wrong |")
     print("|---|---|---|---|---|")
     for name in names:
         began, found, true = time.monotonic(), repeated(name, repetitions, colour), PLANTS[name].true

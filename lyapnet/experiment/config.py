@@ -308,7 +308,7 @@ class TrainingConfig:
     )
     least_gain: float = setting(
         0.0,
-        "Early stopping if the validation loss falls, or could fall, by less than this in 40 steps; 0: all iterations.",
+        "Early stopping if the validation loss falls by less than this in 40 steps, or the law is optimal; 0: never.",
         at_least=0,
     )
     validate_every: int = setting(10, "Steps between validations, each followed by a checkpoint.", at_least=1)

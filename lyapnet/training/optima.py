@@ -35,7 +35,7 @@ BY_ORACLE = 16  # first of these states, which the oracle solves too
 RANDOM_GUESSES = 6  # random controls as initial guesses if there is no expansion
 MAX_DERIVATIVE_ENTRIES = 50_000_000  # numbers in all second derivatives (400 MB), which limits the optima
 MAX_CURVATURE_RATIO = 100  # largest entry of V_xx relative to its median: more than this is no minimum
-SEARCH_SECONDS = 30.0  # seconds of work for each of the three searches
+SEARCH_SECONDS = 30.0  # seconds of work for each search
 ORACLE_IMPROVEMENT = 0.999  # cost ratio below which the optimum of the oracle replaces ours
 MIN_IMPROVED_SHARE = 0.25  # share of improved optima from which on the oracle solves all states
 NEIGHBOURS = 4  # nearest states whose optima are tried as initial guesses
@@ -132,24 +132,32 @@ def _improve_by_oracle(
     progress = partial(report, f"optima by the oracle within {SEARCH_SECONDS:.0f} s of work")
     x0, far = optimum.path.x[0], min(BY_ORACLE, len(optimum.path.cost))
     found = oracle.solve(x0[:far], progress=progress, seconds=SEARCH_SECONDS)
-    optimum, gained = _replace_improved(problem, optimum, torch.arange(far), found)
-    left = SEARCH_SECONDS - (seconds_of_work() - began)
+    until = began + SEARCH_SECONDS
+    optimum, gained = _replace_improved(problem, optimum, torch.arange(far), found, until - seconds_of_work())
+    left = until - seconds_of_work()
     if gained < MIN_IMPROVED_SHARE * far or left < 0:
         return optimum, None
     found = oracle.solve(torch.cat([x0[far:], others]), progress=progress, seconds=left)
-    optimum, _ = _replace_improved(problem, optimum, torch.arange(far, len(x0)), found)
+    optimum, _ = _replace_improved(problem, optimum, torch.arange(far, len(x0)), found, until - seconds_of_work())
     return optimum, None if found.u is None else found.u[:, len(x0) - far :]
 
 
-def _replace_improved(problem: Problem, optimum: Optimum, rows: Tensor, found: Optima) -> tuple[Optimum, int]:
-    """Replace some optima by cheaper ones of the oracle; returns also how many were replaced."""
+def _replace_improved(
+    problem: Problem, optimum: Optimum, rows: Tensor, found: Optima, seconds: float
+) -> tuple[Optimum, int]:
+    """Replace some optima by cheaper ones of the oracle; returns also how many were replaced.
+
+    Args:
+        seconds: seconds of work after which their search ends.
+    """
     if found.u is None:
         return optimum, 0
     size, cost = sizes(problem, optimum.path.cost)[rows], found.cost[: len(rows)]
     has_controls = found.u[:, : len(rows)].isfinite().all(-1).all(0)
     better = torch.nonzero(has_controls & (cost < optimum.path.cost[rows] - (1 - ORACLE_IMPROVEMENT) * size)).flatten()
     if len(better):
-        closer = optimal_trajectories(problem, optimum.path.x[0, rows[better]], found.u[:, better], softer_first=False)
+        x0, u = optimum.path.x[0, rows[better]], found.u[:, better]
+        closer = optimal_trajectories(problem, x0, u, seconds=max(seconds, 0.0), softer_first=False)
         optimum = _replace_rows(optimum, rows[better], closer)
     return optimum, len(better)
 

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.experiment.config import Config
 from lyapnet.loop.programs import ValueProgram
 from lyapnet.training.curves import members_of
@@ -17,15 +18,15 @@ from lyapnet.training.stage_messages import StageMessages
 WINDOW = 40  # steps in which the validation loss has to fall
 COOLING = 40  # steps of the final decay of the learning rate
 NOISE_FACTOR = 5.0  # largest distance of the window's mean loss from the least loss, in units of `least_gain`
+MAX_VALUE_ERROR = 0.02  # largest mean |V(0, x₀) − J*|, relative to mean J*, of a V that counts as nearly optimal
 PATIENCE = 120  # steps without a lower loss after which even an oscillating loss has stopped falling
 
 
 class Settling(Callback):
     """Decays a member's learning rate over COOLING steps once further steps bring nothing; then ends.
 
-    With the value program they bring nothing if the mean cost of the validation states, where the optimum is known, is
-    within `least_gain` of it and no state is lost, as after many fits to optima. Otherwise they do if the validation
-    loss has stopped falling, that is, if both hold:
+    That is so if the law and V are nearly optimal, as after many fits to optima (see `_is_optimal`), or if the
+    validation loss has stopped falling, that is, if both hold:
 
     1. Its least value in the last WINDOW steps is less than `least_gain` below its least value before. The warmup does
        not count.
@@ -84,7 +85,7 @@ class Settling(Callback):
                 continue
             named = f" of {member.label.replace('_', ' ')}" if member.label else ""
             if self._is_optimal(member, module.device):
-                reason = f"the law{named} costs less than {self.least_gain:.2%} more than the optimum"
+                reason = f"the law{named} costs less than {100 * self.least_gain:g} % more than the optimum"
             elif step >= self.warmup and self._has_stopped(member.label, step):
                 reason = f"in {WINDOW} steps the validation loss{named} fell by less than {self.least_gain:g}"
             else:
@@ -95,17 +96,31 @@ class Settling(Callback):
                 self.stages.console.print(f"settled: {reason}; its training ends at step {end}", soft_wrap=True)
 
     def _is_optimal(self, member: Learner, device: torch.device) -> bool:
-        """Whether the cost can fall by less than `least_gain`, relative to the optimum, and nothing else is trained.
+        """Whether law and V are nearly optimal at the validation states whose optimum J* is known.
 
-        Each process has its own validation states; with unknown optima in one of them the answer is no.
+        Under the value program without noise these hold:
+
+        1. Mean max(J − J*, 0) is less than `least_gain` of mean J*, and mean J is not below mean J* by as much, which
+           would show that J* is no optimum.
+        2. Mean |V(0, x₀) − J*| is at most MAX_VALUE_ERROR of mean J*.
+        3. No state is known from which the closed loop costs 5 % more than J*, is gravely lost (see LostStates), or
+           violates a constraint.
+
+        All processes have the same validation states; the mean over them makes them decide alike.
         """
-        if not isinstance(member.program, ValueProgram) or member.pointwise is not None:
+        program, states = member.program, member.validation
+        if not isinstance(program, ValueProgram) or not program.normalise or member.pointwise is not None:
             return False
-        assert member.validation is not None
-        known = member.validation.against_optimum()
-        ratio, lost = known["cost_ratio"], known.get("lost_fraction") or member.lost_excess
-        excess = math.inf if ratio is None or lost else ratio - 1
-        return number_over_processes(excess, device) < self.least_gain
+        if states is None or states.optimal_cost is None or not states.has_goal or member.problem.noise is not None:
+            return False
+        known, violated = states.against_optimum(), states.violated
+        ratio, error, lost = known["cost_ratio"], known["value_error"], known.get("lost_fraction") or member.lost_excess
+        if ratio is None or error is None or lost or (violated is not None and bool(violated.any())):
+            return False
+        above = ratio_of_means(states.cost.maximum(states.optimal_cost), states.optimal_cost)
+        assert above is not None
+        excess = number_over_processes(max(above - 1, 1 - ratio), device)
+        return program.trajectory_cost * excess < self.least_gain and error <= MAX_VALUE_ERROR
 
     def _has_stopped(self, label: str, step: int) -> bool:
         losses = self.losses[label]

@@ -87,7 +87,7 @@ def test_an_optimum_of_the_oracle_without_controls_replaces_none():
     u = good.u.clone()
     u[:, 1] = torch.nan
     found = Optima(good.cost, [""] * 3, u)
-    improved, count = optima._replace_improved(problem, idle, torch.arange(3), found)
+    improved, count = optima._replace_improved(problem, idle, torch.arange(3), found, seconds=100.0)
     assert count == 2
     assert_close(improved.path.cost[1], idle.path.cost[1])
     assert_close(improved.path.cost[::2], good.cost[::2], rtol=1e-6, atol=0)

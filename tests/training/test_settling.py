@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -11,7 +12,7 @@ from rich.console import Console
 from lyapnet.evaluation.states import StateTable
 from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.experiment.config import config_from_plain
-from lyapnet.loop.programs import LyapunovProgram
+from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.training.build import build_module
 from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
@@ -89,23 +90,44 @@ def test_the_loss_of_the_start_counts_once_patience_is_out(losses, stopped):
 OPTIMA, UNKNOWN = [1.0, 2.0, math.nan], [math.nan] * 3
 
 
+NEAR = [1.0005, 2.0005, 9.0]
+ONE_VIOLATES = torch.tensor([[-1.0], [1.0], [-1.0]])
+
+
 @pytest.mark.parametrize(
-    ("cost", "optima", "changes", "optimal"),
+    ("cost", "optima", "states", "changes", "optimal"),
     [
-        ([1.0005, 2.0005, 9.0], OPTIMA, {}, True),
-        ([1.002, 2.002, 3.0], OPTIMA, {}, False),
-        ([1.1, 1.9, 3.0], OPTIMA, {}, False),  # one state is lost, though the mean is right
-        ([1.0005, 2.0005, 9.0], OPTIMA, {"lost_excess": 3.0}, False),
-        ([1.0, 2.0, 3.0], UNKNOWN, {}, False),
-        ([1.0, 2.0, 3.0], None, {}, False),
-        ([1.0005, 2.0005, 9.0], OPTIMA, {"program": LyapunovProgram()}, False),  # which trains its condition too
+        (NEAR, OPTIMA, {}, {}, True),
+        ([1.0005, 2.0005, math.nan], OPTIMA, {}, {}, True),  # not finite where nothing is known
+        ([1.002, 2.002, 3.0], OPTIMA, {}, {}, False),
+        ([1.1, 1.9, 3.0], OPTIMA, {}, {}, False),  # one state is lost, though the mean is right
+        ([1.04, 1.96, 3.0], OPTIMA, {}, {}, False),  # below J* at one state, which is no reason for the other
+        ([0.97, 1.94, 3.0], OPTIMA, {}, {}, False),  # below J*, which is no optimum then
+        ([1.0005, math.nan, 3.0], OPTIMA, {}, {}, False),
+        (NEAR, OPTIMA, {"value": torch.tensor([1.1, 2.1, 9.0])}, {}, False),
+        (NEAR, OPTIMA, {"worst": ONE_VIOLATES}, {}, False),
+        (NEAR, OPTIMA, {"has_goal": False}, {}, False),
+        (NEAR, OPTIMA, {}, {"lost_excess": 3.0}, False),
+        (NEAR, OPTIMA, {}, {"pointwise": torch.nn.Identity()}, False),
+        (NEAR, OPTIMA, {}, {"program": ValueProgram(trajectory_cost=1, normalise=False)}, False),
+        (
+            NEAR,
+            OPTIMA,
+            {},
+            {"program": ValueProgram(trajectory_cost=10)},
+            False,
+        ),  # its loss falls by ten times as much
+        (NEAR, OPTIMA, {}, {"program": LyapunovProgram()}, False),  # which trains its condition too
+        ([1.0, 2.0, 3.0], UNKNOWN, {}, {}, False),
+        ([1.0, 2.0, 3.0], None, {}, {}, False),
     ],
 )
-def test_a_law_at_the_optimum_has_settled(cost, optima, changes, optimal):
-    (member,) = build_module(config_from_plain({**SMALL, "program": {"name": "value"}})).members
+def test_a_law_at_the_optimum_has_settled(cost, optima, states, changes, optimal):
+    (member,) = build_module(config_from_plain({**SMALL, "program": {"name": "value", "trajectory_cost": 1}})).members
     x, costs = torch.ones(3, 2), torch.tensor(cost)
     known = None if optima is None else torch.tensor(optima)
-    member.validation = StateTable(x, costs, costs, known, costs, costs, costs > 0, costs > 0, costs, x, costs)
+    table = StateTable(x, costs, costs, known, costs, costs, costs > 0, costs > 0, costs, x, costs)
+    member.validation = replace(table, **states)
     for name, value in changes.items():
         setattr(member, name, value)
     assert Settling(1e-3, 0, StageMessages(Console(), ""))._is_optimal(member, torch.device("cpu")) is optimal
@@ -121,7 +143,7 @@ def test_a_training_that_starts_at_the_optimum_is_short(tmp_path):
         "evaluation": {**LONG["evaluation"], "optimum": True},
     }
     one, out = trained(tmp_path / "optimal", **changes)
-    assert f"settled: the law costs less than 0.10% more than the optimum; its training ends at step {COOLING}" in out
+    assert f"settled: the law costs less than 0.1 % more than the optimum; its training ends at step {COOLING}" in out
     assert checkpoint(one, "last")["global_step"] == COOLING
 
 

@@ -22,7 +22,7 @@ POLISHING_STEPS = 1  # number of last Newton steps without a line search, which 
 
 
 def minimise_over_controls(problem: Problem, Q: Objective, starts: Several, weight: ControlMatrix) -> Control:
-    """argmin over u ∈ U of Q(u) + s(u), (*batch, m), the best of the local minima found from several starts.
+    """argmin over u ∈ U of Q(u) + s(u), (*batch, m), from the start that is best after FIRST_STEPS Newton steps.
 
     A Newton step leads towards the minimiser over U of the quadratic model of Q plus s, with a line search. An
     indefinite Q_uu is made positive definite by adding twice its absolute row sums to the diagonal, and the weight. The

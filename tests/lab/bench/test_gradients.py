@@ -106,6 +106,14 @@ def test_multiply_adds_of_a_network(hidden, products):
     assert multiply_adds(case) == 10 * 2 * products
 
 
+def test_shares_of_the_peak_are_inverse_to_seconds(rows_of):
+    """A gradient counts three times the arithmetic of its closed loop."""
+    rows = rows_by_route(rows_of("--routes", "rollout,discrete"))
+    loop, gradient = (rows[name]["peak_share"] * rows[name]["seconds"] for name in ("rollout", "discrete"))
+    assert gradient == pytest.approx(3 * loop)
+    assert 0 < rows["discrete"]["peak_share"] < 1
+
+
 def test_peak_of_known_tensors():
     def call():
         first, second = torch.empty(1000), torch.empty(2000)

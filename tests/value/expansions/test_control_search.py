@@ -16,8 +16,10 @@ from lyapnet.task.sets import Box, ControlBox, Unbounded
 from lyapnet.task.systems import ControlSystem, DoubleIntegrator, Glider, KinematicBicycle
 from lyapnet.value.expansions import (
     derivatives_of,
+    follow_expansions,
     greedy_law,
     held_control,
+    in_float64,
     minimise_over_controls,
     optimal_trajectories,
     path_under,
@@ -126,6 +128,17 @@ def test_a_control_near_a_given_one_is_a_local_minimum_there():
     near = held_control(problem, x, free, V_x, H, near=free.u)
     assert (Q(near) <= Q(free.u)).all()
     assert (Q(near) > Q(best) + 1e-2).any(), "another minimum, which the search from several controls leaves"
+
+
+def test_an_optimum_is_followed_near_its_own_controls():
+    """From its own start the law of its expansion is the optimum again; near other controls it is another law."""
+    problem = in_float64(sideways())
+    x0 = problem.initial_states.sample(8, torch.Generator().manual_seed(0)).double()
+    found = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 8, problem.system.m))
+    u = found.path.u
+    assert_close(follow_expansions(problem, found.expansion, u, x0).u, u, atol=1e-4, rtol=0)
+    others = follow_expansions(problem, found.expansion, torch.full_like(u, 1.0), x0)
+    assert not torch.allclose(others.u, u, atol=1e-2)
 
 
 def test_without_limits_a_start_on_a_hill_is_left():

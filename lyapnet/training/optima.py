@@ -157,7 +157,7 @@ def _replace_improved(
     better = torch.nonzero(has_controls & (cost < optimum.path.cost[rows] - (1 - ORACLE_IMPROVEMENT) * size)).flatten()
     if len(better):
         x0, u = optimum.path.x[0, rows[better]], found.u[:, better]
-        closer = optimal_trajectories(problem, x0, u, seconds=max(seconds, 0.0), softer_first=False)
+        closer = optimal_trajectories(problem, x0, u, seconds=seconds, softer_first=False)
         optimum = _replace_rows(optimum, rows[better], closer)
     return optimum, len(better)
 

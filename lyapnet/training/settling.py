@@ -111,11 +111,11 @@ class Settling(Callback):
         program, states = member.program, member.validation
         if not isinstance(program, ValueProgram) or not program.normalise or member.pointwise is not None:
             return False
-        if states is None or states.optimal_cost is None or not states.has_goal or member.problem.noise is not None:
+        if states is None or states.optimal_cost is None or member.problem.noise is not None:
             return False
         known, violated = states.against_optimum(), states.violated
         ratio, error, lost = known["cost_ratio"], known["value_error"], known.get("lost_fraction") or member.lost_excess
-        if ratio is None or error is None or lost or (violated is not None and bool(violated.any())):
+        if ratio is None or error is None or lost or (violated is not None and violated.any()):
             return False
         above = ratio_of_means(states.cost.maximum(states.optimal_cost), states.optimal_cost)
         assert above is not None

@@ -88,8 +88,6 @@ def test_the_loss_of_the_start_counts_once_patience_is_out(losses, stopped):
 
 
 OPTIMA, UNKNOWN = [1.0, 2.0, math.nan], [math.nan] * 3
-
-
 NEAR = [1.0005, 2.0005, 9.0]
 ONE_VIOLATES = torch.tensor([[-1.0], [1.0], [-1.0]])
 
@@ -110,13 +108,7 @@ ONE_VIOLATES = torch.tensor([[-1.0], [1.0], [-1.0]])
         (NEAR, OPTIMA, {}, {"lost_excess": 3.0}, False),
         (NEAR, OPTIMA, {}, {"pointwise": torch.nn.Identity()}, False),
         (NEAR, OPTIMA, {}, {"program": ValueProgram(trajectory_cost=1, normalise=False)}, False),
-        (
-            NEAR,
-            OPTIMA,
-            {},
-            {"program": ValueProgram(trajectory_cost=10)},
-            False,
-        ),  # its loss falls by ten times as much
+        (NEAR, OPTIMA, {}, {"program": ValueProgram(trajectory_cost=10)}, False),  # ten times the fall of the loss
         (NEAR, OPTIMA, {}, {"program": LyapunovProgram()}, False),  # which trains its condition too
         ([1.0, 2.0, 3.0], UNKNOWN, {}, {}, False),
         ([1.0, 2.0, 3.0], None, {}, {}, False),

@@ -14,7 +14,7 @@ from lyapnet.evaluation.oracles.base import Report
 HOPELESS = 8  # if this number of first states fail, the others are not tried
 SECONDS = 15.0  # seconds for one state, after which no further initial guess is tried
 EXPLORED = 16  # first states on which all initial guesses are tried, to detect several local minima
-EXPLORED_AGAIN = 8  # the same, if an earlier batch over the same X₀ had a single minimum from each state
+EXPLORED_AGAIN = 4  # the same, if an earlier batch over the same X₀ had a single minimum from each state
 NEIGHBOURS = 3  # nearest initial states, whose optima are initial guesses for each other
 SAME = 1e-6  # relative difference below which two costs count as equal
 

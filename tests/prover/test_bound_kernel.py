@@ -1,5 +1,7 @@
 """Bounds by machine code agree with those of the interpreter, which is used where there is no machine code."""
 
+import math
+
 import mpmath
 import pytest
 import torch
@@ -56,6 +58,15 @@ def test_bounds_are_those_of_the_interpreter(operation, degree):
         outside, inside = differences(*found)
         assert outside < (1e-11 if operation is LEAST else 1e-12)
         assert inside < 1e-10
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.2, None), (None, 0.2), (-0.2, math.inf), (-math.inf, 0.2), (-0.2, 0.2)])
+def test_limits_on_one_side_are_those_of_the_interpreter(low, high):
+    sides = [None if side is None else torch.tensor(side, dtype=torch.float64) for side in (low, high)]
+    function, boxes = graph_of(lambda y, z, M, N: aten.clamp.Tensor(y, *sides), 0), random_boxes(120, 0)
+    forms, others = both(function, *boxes, 2)
+    assert max(differences(forms, others)) < 1e-10
+    assert not violated(forms[0].interval(), values_on(function, *boxes)).any()
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

@@ -65,6 +65,17 @@ def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("interval", [0.0, math.inf])
+def test_a_proof_is_kept_during_its_search(P, tmp_path, monkeypatch, interval):
+    """The twin: not before the interval has passed."""
+    monkeypatch.setattr(proof, "SAVE_INTERVAL", interval)
+    path, found = tmp_path / "proof.pt", list[bool]()
+    go_on(dipped(P), path, boxes=300, report=lambda _: found.append(path.exists()))
+    assert len(found) > 1
+    assert any(found) is (interval == 0)
+    assert path.exists()
+
+
 @pytest.mark.gate
 @pytest.mark.parametrize(("condition", "wanted"), sample([(dipped, 2.0), (violated, 6.0)], 2))
 def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):

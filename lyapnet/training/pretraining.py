@@ -44,10 +44,13 @@ PACE_SHARE = 0.1  # share of these seconds after which the pace decides whether 
 MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
 NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
-MAX_ROUNDS = 4  # rounds of fitting at the states that the fitted law visits
+MAX_ROUNDS = 8  # rounds of fitting at the states that the fitted law visits
+ROUNDS_SECONDS = 120.0  # seconds of work after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
+FAR_COST_RATIO = 1.003  # cost relative to the optima above which rounds take more steps and more patience
+FAR_STEPS_FACTOR = 4  # factor of the steps of such a round
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
-PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
+PATIENCE, FAR_PATIENCE = 2, 4  # consecutive rounds without gain after which the rounds stop; the same while far
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
 MIN_OPTIMA = 32  # with fewer, states beyond them outweigh those along them
@@ -362,9 +365,11 @@ def fit(
 ) -> FitResult:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, after PATIENCE
-    rounds without gain, or when another law of V costs less while half of the closed loops cost POOR_COST_RATIO times
-    their optimum. The V with the cheapest law is kept.
+    The rounds end after MAX_ROUNDS or ROUNDS_SECONDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima,
+    after PATIENCE rounds without gain, or when another law of V costs less while half of the closed loops cost
+    POOR_COST_RATIO times their optimum. While the law costs more than FAR_COST_RATIO times the optima, as within tight
+    limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, and FAR_PATIENCE holds.
+    The V with the cheapest law is kept.
 
     Args:
         report: called with each stage of the work.
@@ -375,19 +380,22 @@ def fit(
     method = fitting.method
     best, least, rounds_without_gain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
     size = float(sizes(learner.problem, optimum.path.cost).mean())
-    enough, gain = float(optimum.path.cost.mean()) + (SUFFICIENT_COST_RATIO - 1) * size, MIN_GAIN * size
+    enough, far = (float(optimum.path.cost.mean()) + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, FAR_COST_RATIO))
+    gain, until = MIN_GAIN * size, seconds_of_work() + ROUNDS_SECONDS
     for k in range(MAX_ROUNDS + 1):
         again = f" where its law leads ({k} of at most {MAX_ROUNDS})" if k else ""
         late = min(k, 1)
         within = f"within {FIT_SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        fitting.lower(examples, method.steps[late], method.rate[late], FIT_SECONDS[late], progress)
+        steps = method.steps[late] * (FAR_STEPS_FACTOR if k and least[1] > far else 1)
+        fitting.lower(examples, steps, method.rate[late], FIT_SECONDS[late], progress)
         path = learner.path_from(optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         rounds_without_gain = 0 if now < (least[0], least[1] - gain) else rounds_without_gain + 1
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == MAX_ROUNDS or now[1] <= enough or rounds_without_gain == PATIENCE:
+        patience = FAR_PATIENCE if least[1] > far else PATIENCE
+        if k == MAX_ROUNDS or now[1] <= enough or rounds_without_gain >= patience or seconds_of_work() > until:
             break
         if float((path.cost / optimum.path.cost).median()) > POOR_COST_RATIO:
             gain_of_other = gain_of_another_law()

@@ -178,9 +178,18 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     given, costs = draw_examples(problem, seen, GENERATOR), list[float]()
     mean, led = float(seen.path.cost.mean()), Learner.path_from
 
+    steps, lower = list[int](), pretraining._Fit.lower
+
+    def lowering(self, examples, count, *arguments):
+        steps.append(count)
+        lower(self, examples, min(count, 60), *arguments)
+
+    monkeypatch.setattr(pretraining._Fit, "lower", lowering)
+
     def fitted(*pretended):
         """The cost of the law that is kept, and of each that was tried; the mean cost of each is pretended."""
         costs.clear()
+        steps.clear()
 
         def pretending(learner, x0):
             path = led(learner, x0)
@@ -197,16 +206,25 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     kept = fitted(2, 1.5, 1.0005)
     assert len(costs) == 3
     assert kept == pytest.approx(costs[2], rel=1e-6)
-    kept = fitted(2, 1.5, 1.7, 1.6, 1)
+    assert steps == [60, 120, 120], "far from the optimum a round takes four times as many"
+    kept = fitted(1.1, 1.0025, 1.0027, 1.0026, 1)
     assert len(costs) == 4, "the third and the fourth gain nothing"
+    assert steps == [60, 120, 30, 30]
     assert kept == pytest.approx(costs[1], rel=1e-6)
     assert costs[1] != pytest.approx(costs[3], rel=1e-6)
-    kept = fitted(2, 1.5, 1.7, 1.2, 1)
+    kept = fitted(1.1, 1.0025, 1.0027, 1.002, 1)
     assert len(costs) == 5, "after one in vain there is another"
     assert kept == pytest.approx(costs[4], rel=1e-6)
-    kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1)
+    kept = fitted(2, 1.5, 1.7, 1.6, 1.8, 1.2, 1)
+    assert len(costs) == 7, "far from the optimum also after three in vain"
+    fitted(2, 1.5, 1.7, 1.6, 1.8, 1.9, 1)
+    assert len(costs) == 6, "but not after four"
+    kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1, 1.09, 1.08, 1.07, 1.0)
     assert len(costs) == 1 + pretraining.MAX_ROUNDS
-    assert kept == pytest.approx(costs[4], rel=1e-6)
+    assert kept == pytest.approx(costs[8], rel=1e-6)
+    monkeypatch.setattr(pretraining, "ROUNDS_SECONDS", 0.0)
+    fitted(2, 1.5, 1.0)
+    assert len(costs) == 1, "no time is left for a round"
 
 
 @pytest.mark.gate

@@ -365,10 +365,10 @@ def fit(
 ) -> FitResult:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The rounds end after MAX_ROUNDS or ROUNDS_SECONDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima,
-    after PATIENCE rounds without gain, or when another law of V costs less while half of the closed loops cost
+    The rounds end after MAX_ROUNDS or ROUNDS_SECONDS, after PATIENCE rounds without gain, when the law costs at most
+    SUFFICIENT_COST_RATIO times the optima, or when another law of V costs less while half of the closed loops cost
     POOR_COST_RATIO times their optimum. While the law costs more than FAR_COST_RATIO times the optima, as within tight
-    limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, and FAR_PATIENCE holds.
+    limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, with FAR_PATIENCE.
     The V with the cheapest law is kept.
 
     Args:

@@ -56,6 +56,8 @@ def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
     expected = mean / (BETA * mean - DELTA * problem().horizon.duration)
     assert expected - 1e-3 < result["certified_ratio"] < 1.01 * expected
     assert result["lower_fingerprint"] != result["fingerprint"]
+    sides = riccatis.above, riccatis.below
+    assert result["seconds"] == pytest.approx(sum(side.claim.seconds for side in sides))
 
 
 @pytest.mark.gate

@@ -23,7 +23,7 @@ HANGAR = """
 import torch
 from lightning.pytorch import Callback
 from torch import nn
-from lyapnet import ControlAffineSystem, ValueFunction
+from lyapnet import ControlAffineSystem, Cost, ValueFunction
 
 class Balloon(ControlAffineSystem):
     state_names, state_units = ("height", "speed"), ("m", "m/s")
@@ -58,6 +58,16 @@ class Bowl(ValueFunction):
 
     def forward(self, t, x):
         return self.weight * (x**2).sum(-1) + 0 * t
+
+class Price(Cost):
+    def state(self, x):
+        return (x**2).sum(-1)
+
+    def R(self, x):
+        return torch.ones_like(x[..., :1, None])
+
+    def terminal(self, x):
+        return (x**2).sum(-1)
 """
 
 

@@ -110,6 +110,7 @@ IMPOSSIBLE = [
     ("network.epsilon", -1), ("rollout.compile", "perhaps"), ("program.name", "value"), ("controls.name", "ball"),
     ("pointwise", {"weight": 1, "points": 10**13}), ("pointwise", {"weight": 1, "counterexamples": "no.csv"}),
     ("pointwise", {"points": 10**13}),
+    ("system.angles", ["velocity"]), ("system.title", "Sledge"),
     ("pointwise", {"weight": 1, "region": [1, 2, 3]}), ("training.optimizer", "sgd"), ("training.precision", "half"),
 ]  # fmt: skip
 

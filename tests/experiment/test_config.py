@@ -219,6 +219,14 @@ IMPOSSIBLE = {
     "system.name=linear": ("system.parameters.A", "linear"),
     "system.name=cartpole & system.parameters.mass=1": ("system.parameters.mass", "cart_mass"),
     "system.name=reacher": ("initial_states", "4", "shoulder angle"),
+    "system.angles=[velocity]": ("system.angles", "system.name=double_integrator"),
+    "system.equations='der(a) = a'": ("system.equations", "system.name=double_integrator"),
+    "system.title=Sledge": ("system.title", "system.name=double_integrator"),
+    "cost.name=hangar:Price": ("cost.Q", "cost.name=hangar:Price"),
+    "cost.name=hangar:Price & cost.Q=null & cost.R=null & cost.Q_T=null & cost.periodic=[position]": (
+        "cost.periodic",
+        "cost.name=hangar:Price",
+    ),
     "system={name: linear, parameters: {A: [[0, 1], [0, 0]], B: [[0], [1]]}} & cost.R=inverse_mass": (
         "cost",
         "R",

@@ -3,7 +3,7 @@
 import importlib
 import inspect
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from lyapnet.experiment.config import Config, SystemConfig
 from lyapnet.loop.programs import PROGRAMS, Program
 from lyapnet.task.constraints import CONSTRAINTS, Constraints
 from lyapnet.task.control_sets import CONTROL_SETS
-from lyapnet.task.cost import COSTS, Cost
+from lyapnet.task.cost import COSTS, Cost, QuadraticCost
 from lyapnet.task.models.reading import KINDS
 from lyapnet.task.sets import ControlSet
 from lyapnet.task.systems import NAMED_SYSTEMS, ControlSystem, EquationSystem
@@ -48,6 +48,11 @@ REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
     "constraints": (CONSTRAINTS, Constraints),
     "network": (NETWORKS, ValueFunction),
     "program": (PROGRAMS, Program),
+}
+# section ↦ (the one class that reads these settings, their keys)
+SETTINGS_OF_ONE_CLASS: dict[str, tuple[type, Sequence[str]]] = {
+    "system": (EquationSystem, ("equations", "states", "controls", "angles", "drawing", "title")),
+    "cost": (QuadraticCost, ("Q", "R", "Q_T", "periodic")),
 }
 
 
@@ -88,9 +93,18 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
 
 
 def class_of(options: Any, part: str) -> Any:
-    """The class that a section of a config names, or the class for its equations."""
+    """The class that a section of a config names, or the class for its equations.
+
+    Raises:
+        UsageError: no such class, or a setting that this class does not read.
+    """
     registry, base = REGISTRIES[part]
     cls = resolve(options.name, registry, f"{part}.name", base)
+    reader, keys = SETTINGS_OF_ONE_CLASS.get(part, (cls, ()))
+    for key in keys if cls is not reader else ():
+        if getattr(options, key) not in (None, "", [], {}):
+            advice = f"remove it, or choose another {part}.name"
+            raise UsageError(f"Expected no {part}.{key} with {part}.name={options.name}, got one; {advice}.")
     return class_of_equations(options) if cls is EquationSystem else cls
 
 

@@ -46,11 +46,14 @@ def trained(tmp_path_factory):
 
 
 def train(arguments: list[str]) -> int:
-    return main(["train", *[a for a in arguments if not a.startswith(("training.iter", "horizon.steps"))], *SHORT])
+    return main(brief(["train", *arguments]))
 
 
 def brief(arguments: list[str]) -> list[str]:
     """Few states and steps, one task or value of several, a second for a proof; any other command as it is."""
+    if arguments[0] == "train":
+        shortened = tuple(setting.split("=")[0] for setting in SHORT)
+        return [*[a for a in arguments if not a.startswith(shortened)], *SHORT]
     if arguments[0] == "sweep":
         if "--vary" not in arguments:
             return [*arguments[:3], *SHORT]

@@ -45,12 +45,13 @@ MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's c
 NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 MAX_ROUNDS = 8  # rounds of fitting at the states that the fitted law visits
-ROUNDS_SECONDS = 120.0  # seconds of work after which no further round begins
+ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
-FAR_COST_RATIO = 1.003  # cost relative to the optima above which rounds take more steps and more patience
-FAR_STEPS_FACTOR = 4  # factor of the steps of such a round
+PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
+FAR_COST_RATIO = 1.003  # cost of the best law so far, relative to the optima, above which the law counts as far
+FAR_PATIENCE = 4  # the patience while the law is far
+FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while the law is far
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
-PATIENCE, FAR_PATIENCE = 2, 4  # consecutive rounds without gain after which the rounds stop; the same while far
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
 MIN_OPTIMA = 32  # with fewer, states beyond them outweigh those along them
@@ -59,7 +60,7 @@ NEIGHBOUR_TRUST_LIMIT = 1.0  # the same for deviations towards neighbours
 
 
 class Method(NamedTuple):
-    """The optimizer of a fit; pairs are for the first fit and for the further rounds."""
+    """The optimizer of a fit; pairs are for the first fit and for a further round, while the law is not far."""
 
     optimizer: Callable[..., torch.optim.Optimizer]
     steps: tuple[int, int]
@@ -85,6 +86,13 @@ class FitResult(NamedTuple):
 
 
 NOT_FITTED = FitResult(math.inf, 0.0)
+
+
+class LawCost(NamedTuple):
+    """What a law costs from the initial states of the optima; the smaller of two is better."""
+
+    share_lost: float  # of closed loops that end in infinite costs
+    mean: float  # of J, infinite if a loop is lost
 
 
 class Examples(NamedTuple):
@@ -184,19 +192,18 @@ def _trusted_share(problem: Problem, optimum: Optimum, deviation: StatePath, sha
 def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
     """The rows at some deviations (N, b, n) from the finite trajectories; rows with non-finite entries are left out."""
     problem, optimum = in_float64(problem), _select_finite(optimum)
-    columns = (
-        _example_columns(problem, optimum, each, at)
+    blocks = [
+        _example_columns(problem, optimum, each, about_best)
         for each in deviations
-        for at in _reference_controls(problem, ahead)
-    )
-    parts = zip(*columns, strict=True)
-    examples = Examples(*(torch.cat(columns) for columns in parts))
+        for about_best in _reference_controls_are_best(problem, ahead)
+    ]
+    examples = Examples(*map(torch.cat, zip(*blocks, strict=True)))
     defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
     return examples.each(lambda column: column[defined])
 
 
-def _reference_controls(problem: Problem, ahead: bool) -> Sequence[bool]:
-    """The reference controls of the rows: False for the control at rest, True for the best control.
+def _reference_controls_are_best(problem: Problem, ahead: bool) -> Sequence[bool]:
+    """For each row of a state, whether its reference control is the best control or the control at rest.
 
     The lookahead law searches from the control at rest to the best one, so V has to be accurate at both. With
     constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one
@@ -269,8 +276,7 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
         answer = problem.response(now, about)
         _, slope, bend = penalty_of_one_step(problem, answer.x)
         B = answer.by_control
-        values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
-        W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
+        W = _raise_eigenvalues(answer.curvature + dt * B.mT @ (H + bend) @ B, floor)
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
         return answer.x, B, answer.slope, W, _best_control_of_fit(problem, W / 2, b - apply(W, about))
 
@@ -282,20 +288,26 @@ def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, abou
             led, B, slope, W, best = responses(about)
     else:
         free = problem.response(now)
-        _, steep, bend = penalty_of_one_step(problem, free.x)
-        V_x, H = gradient[1:] + apply(H, free.x - x[1:]) + steep, H + bend
-        about = best = held_control(problem, now, free, V_x, H)
-        values, vectors = torch.linalg.eigh(derivatives_of(step_objective(problem, now, free, V_x, H), best)[1])
-        W, answer = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT, problem.response(now, best)
+        _, slope, bend = penalty_of_one_step(problem, free.x)
+        V_x, V_xx = gradient[1:] + apply(H, free.x - x[1:]) + slope, H + bend
+        about = best = held_control(problem, now, free, V_x, V_xx)
+        W = _raise_eigenvalues(derivatives_of(step_objective(problem, now, free, V_x, V_xx), best)[1], floor)
+        answer = problem.response(now, best)
         B, slope, led = answer.by_control, answer.slope, answer.x
         if not about_best:  # the law evaluates V where the nominal control leads
-            slope, led = slope + apply(B.mT, apply(H, led - free.x)), free.x
+            slope, led = slope + apply(B.mT, apply(V_xx, led - free.x)), free.x
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _error_scale(problem, optimum)
     rate = cost / problem.horizon.duration
     if problem.horizon.stationary:
         rate = rate.maximum(-value.diff(dim=0) / dt)
     columns = (t[:-1], now, here, t[1:], about, led, B, slope, W, best, cost, rate)
     return [y.flatten(0, 1).detach() for y in columns]
+
+
+def _raise_eigenvalues(matrix: Tensor, floor: Tensor) -> Tensor:
+    """Symmetric matrices with all eigenvalues raised to at least a floor."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
 
 
 def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tensor, Tensor]:
@@ -367,47 +379,51 @@ def fit(
 
     The rounds end after MAX_ROUNDS or ROUNDS_SECONDS, after PATIENCE rounds without gain, when the law costs at most
     SUFFICIENT_COST_RATIO times the optima, or when another law of V costs less while half of the closed loops cost
-    POOR_COST_RATIO times their optimum. While the law costs more than FAR_COST_RATIO times the optima, as within tight
-    limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, with FAR_PATIENCE.
-    The V with the cheapest law is kept.
+    POOR_COST_RATIO times their optimum. While the best law so far costs more than FAR_COST_RATIO times the optima, as
+    within tight limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, with
+    FAR_PATIENCE. The V with the cheapest law is kept. Where ROUNDS_SECONDS end the rounds, the result depends on the
+    machine.
 
     Args:
         report: called with each stage of the work.
         gain_of_another_law: the relative cost that another law of the current V saves, 0 if it does not save enough.
     """
     fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _select_finite(optimum)
-    beyond, gain_of_other = stream(learner.seed, START, 12), 0.0
-    method = fitting.method
-    best, least, rounds_without_gain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
-    size = float(sizes(learner.problem, optimum.path.cost).mean())
-    enough, far = (float(optimum.path.cost.mean()) + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, FAR_COST_RATIO))
-    gain, until = MIN_GAIN * size, seconds_of_work() + ROUNDS_SECONDS
+    later_states, method, gain_of_other = stream(learner.seed, START, 12), fitting.method, 0.0
+    optimal_cost, cost_sizes = float(optimum.path.cost.mean()), sizes(learner.problem, optimum.path.cost)
+    size = float(cost_sizes.mean())
+    sufficient_cost, far_cost = (optimal_cost + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, FAR_COST_RATIO))
+    best_weights, best = copy.deepcopy(learner.V.state_dict()), LawCost(1.0, math.inf)
+    rounds_without_gain, last_start = 0, math.inf
     for k in range(MAX_ROUNDS + 1):
-        again = f" where its law leads ({k} of at most {MAX_ROUNDS})" if k else ""
-        late = min(k, 1)
-        within = f"within {FIT_SECONDS[late]:.0f} s of work"
-        progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        steps = method.steps[late] * (FAR_STEPS_FACTOR if k and least[1] > far else 1)
-        fitting.lower(examples, steps, method.rate[late], FIT_SECONDS[late], progress)
+        phase = min(k, 1)  # the first fit, or a further round
+        where = f" where its law leads ({k} of at most {MAX_ROUNDS} in {ROUNDS_SECONDS:.0f} s)" if k else ""
+        stage = f"fitting V to {len(optimum.path.cost)} optima{where} within {FIT_SECONDS[phase]:.0f} s of work"
+        steps = method.steps[phase] * (FAR_STEPS_FACTOR if k and best.mean > far_cost else 1)
+        fitting.lower(examples, steps, method.rate[phase], FIT_SECONDS[phase], partial(report, stage))
+        if k == 0:
+            last_start = seconds_of_work() + ROUNDS_SECONDS
         path = learner.path_from(optimum.path.x[0])
-        now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
-        rounds_without_gain = 0 if now < (least[0], least[1] - gain) else rounds_without_gain + 1
-        if now < least:
-            best, least = copy.deepcopy(learner.V.state_dict()), now
-        patience = FAR_PATIENCE if least[1] > far else PATIENCE
-        if k == MAX_ROUNDS or now[1] <= enough or rounds_without_gain >= patience or seconds_of_work() > until:
+        cost = LawCost(float((~path.cost.isfinite()).double().mean()), float(path.cost.mean()))
+        has_gained = cost < best._replace(mean=best.mean - MIN_GAIN * size)
+        rounds_without_gain = 0 if has_gained else rounds_without_gain + 1
+        if cost < best:
+            best_weights, best = copy.deepcopy(learner.V.state_dict()), cost
+        patience = FAR_PATIENCE if best.mean > far_cost else PATIENCE
+        is_over = k == MAX_ROUNDS or seconds_of_work() > last_start
+        if is_over or cost.mean <= sufficient_cost or rounds_without_gain >= patience:
             break
-        if float((path.cost / optimum.path.cost).median()) > POOR_COST_RATIO:
+        if float(((path.cost - optimum.path.cost) / cost_sizes).median()) > POOR_COST_RATIO - 1:
             gain_of_other = gain_of_another_law()
             if gain_of_other:
                 break
         examples = examples.concatenated_with(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
         searching = partial(report, "optima from states where its law leads")
-        for further in examples_beyond(learner, optimum, path, beyond, searching):
-            examples = examples.concatenated_with(further)
-    learner.V.load_state_dict(best)
-    finite, cost = -least[0], least[1]
-    return FitResult((cost - float(optimum.path.cost.mean())) / size if finite == 1 else math.inf, gain_of_other)
+        for later in examples_beyond(learner, optimum, path, later_states, searching):
+            examples = examples.concatenated_with(later)
+    learner.V.load_state_dict(best_weights)
+    excess = math.inf if best.share_lost else (best.mean - optimal_cost) / size
+    return FitResult(excess, gain_of_other)
 
 
 def looks_ahead(learner: Learner) -> bool:

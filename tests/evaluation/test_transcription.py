@@ -277,6 +277,18 @@ def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch)
     assert counts[3] > counts[1], "of another X₀"
 
 
+@pytest.mark.parametrize("explored", [EXPLORED, EXPLORED_AGAIN, 1])
+def test_a_batch_tries_as_many_random_curves_however_few_states_are_explored(explored):
+    oracle, box = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
+    x0, nothing = box.sample(20, torch.Generator().manual_seed(0)), [None] * 20
+    search = MultiStart(x0.numpy(), nothing, oracle.minimise, explored)
+    guesses = [len([*each]) for each in oracle._starts(x0, range(20), nothing, search)]
+    without_curves = guesses[-1]
+    curves = [count - without_curves for count in guesses]
+    assert sum(curves) == transcription.RANDOM_CURVE_STATES * transcription.CURVES_PER_STATE
+    assert not any(curves[explored:])
+
+
 def test_states_close_to_each_other_say_nothing_of_others(monkeypatch):
     monkeypatch.setattr(transcription, "_SINGLE_MINIMUM_TASKS", set())
     oracle, box = transcription_of("double_integrator", "horizon.steps=10", "horizon.dt=0.1")

@@ -179,12 +179,16 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     mean, led = float(seen.path.cost.mean()), Learner.path_from
 
     steps, lower = list[int](), pretraining._Fit.lower
+    now, seconds_of_a_fit = 1000.0, 0.0
 
     def lowering(self, examples, count, *arguments):
+        nonlocal now
         steps.append(count)
         lower(self, examples, min(count, 60), *arguments)
+        now += seconds_of_a_fit
 
     monkeypatch.setattr(pretraining._Fit, "lower", lowering)
+    monkeypatch.setattr(pretraining, "seconds_of_work", lambda: now)
 
     def fitted(*pretended):
         """The cost of the law that is kept, and of each that was tried; the mean cost of each is pretended."""
@@ -222,9 +226,9 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1, 1.09, 1.08, 1.07, 1.0)
     assert len(costs) == 1 + pretraining.MAX_ROUNDS
     assert kept == pytest.approx(costs[8], rel=1e-6)
-    monkeypatch.setattr(pretraining, "ROUNDS_SECONDS", 0.0)
-    fitted(2, 1.5, 1.0)
-    assert len(costs) == 1, "no time is left for a round"
+    seconds_of_a_fit = 0.3 * pretraining.ROUNDS_SECONDS
+    fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1, 1.0)
+    assert len(costs) == 5, "the fourth round ends after the time for rounds, which begins after the first fit"
 
 
 @pytest.mark.gate

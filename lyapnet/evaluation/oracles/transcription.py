@@ -173,8 +173,9 @@ class Transcription(Oracle):
     ) -> Iterator[Iterator[Candidate]]:
         """The initial guesses of each pending state: known controls, and a line to the goal with the control at rest.
 
-        The first RANDOM_CURVE_STATES states also try random curves around that line; a better minimum from these is
-        passed on to the other states. If nothing leads to a minimum, the trial path is the last guess.
+        The first explored states, at most RANDOM_CURVE_STATES, also try random curves around that line, as many in all
+        however few they are; a better minimum from these is passed on to the other states. If nothing leads to a
+        minimum, the trial path is the last guess.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()
@@ -183,11 +184,12 @@ class Transcription(Oracle):
         extent = states.abs().amax(0).numpy()
         scale = np.where(extent > 0, extent, 1.0)
         tried, aside = self._scales.paths(states), GOAL_OFFSET * self._scales.of_states * s
-        curves = math.ceil(RANDOM_CURVE_STATES * CURVES_PER_STATE / min(RANDOM_CURVE_STATES, len(pending)))
+        with_curves = min(RANDOM_CURVE_STATES, search.explored, len(pending))
+        curves = math.ceil(RANDOM_CURVE_STATES * CURVES_PER_STATE / with_curves)
         for k, i in enumerate(pending):
             line = goal + (1 - s) * (states[i].numpy() - goal) + aside
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
-            paths = (line, *(line + bends)) if k < RANDOM_CURVE_STATES else (line,)
+            paths = (line, *(line + bends)) if k < with_curves else (line,)
             cold = [Candidate(x, rest, math.inf) for x in paths]
             known = given[i]
             path = Candidate(tried.x[1:, i].numpy(), tried.u[:, i].numpy(), math.inf)

@@ -88,6 +88,14 @@ def with_option(arguments: list[str], name: str, value: str) -> list[str]:
     return [*arguments[: at + 1], value, *arguments[at + 2 :]]
 
 
+def write_if_shown(experiment: str) -> None:
+    """Write the YAML of an experiment that a page shows, unless the file exists."""
+    names = f"{Path(experiment).stem}.yaml", f"experiment: {Path(experiment).stem}\n"
+    shown = [block for block in blocks("yaml") if any(name in block for name in names)]
+    if shown and not Path(experiment).exists():
+        Path(experiment).write_text(shown[0], encoding="utf-8")
+
+
 def trains(arguments: list[str]) -> bool:
     return "trainer.strategy=ddp" not in arguments  # which starts this very process again: see test_distributed
 
@@ -99,6 +107,8 @@ def test_every_command_runs(workplace, capsys):
     for arguments in filter(trains, trainings):
         assert train(arguments) == 0, capsys.readouterr().err
     for arguments in commands("lyapnet"):
+        if arguments[0] == "train":
+            write_if_shown(arguments[arguments.index("--config") + 1])
         outcomes = (0, 1) if arguments[:2] == ["certify", "check"] else (0,)  # a proof of a second is unfinished
         assert main(brief(arguments)) in outcomes, (arguments, capsys.readouterr().err)
 
@@ -137,10 +147,7 @@ def test_every_command_is_understood(workplace):
         if arguments[0] in ("train", "sweep"):
             experiments = given["config"] if arguments[0] == "sweep" else [given["config"]]
             for experiment in experiments:
-                names = f"{Path(experiment).stem}.yaml", f"experiment: {Path(experiment).stem}\n"
-                shown = [block for block in blocks("yaml") if any(name in block for name in names)]
-                if shown and not Path(experiment).exists():  # a file that a page shows
-                    (workplace / experiment).write_text(shown[0], encoding="utf-8")
+                write_if_shown(experiment)
                 load_config(experiment, list(given["overrides"] or ()))
         elif arguments[0] == "compare":
             assert load_comparison(given["config"]).tasks

@@ -1,4 +1,4 @@
-"""Whether the tests notice a changed line. python -m tests.mutations [--count 50] [--seed 0] [FOLDER …]
+"""Whether the tests notice a changed line. python -m tests.mutations [--count 50] [--seed 0] [--first 1] [FOLDER …]
 
 Each mutation changes one place of one file of the folders of lyapnet (prover, claims, value, loop and task by default),
 drawn at random: a comparison is turned around, a sum becomes a difference, a number grows by a tenth, a minimum becomes
@@ -117,6 +117,7 @@ def main() -> None:
     parser.add_argument("folders", nargs="*", default=FOLDERS)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=1, help="number of the first one to try, to go on with the others")
     given = parser.parse_args()
     files = [path for folder in given.folders for path in sorted((ROOT / "lyapnet" / folder).rglob("*.py"))]
     each = [list(mutations(path.read_text(encoding="utf-8"), str(path.relative_to(ROOT)))) for path in files]
@@ -126,8 +127,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "lyapnet"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "logs", "__pycache__", ".venv", "dist"))
-        seconds = {tests: baseline(tests, copy) for tests in sorted({tests_of(mutation.file) for mutation in drawn})}
-        for number, mutation in enumerate(drawn, 1):
+        tried = list(enumerate(drawn, 1))[given.first - 1 :]
+        groups = sorted({tests_of(mutation.file) for _, mutation in tried})
+        seconds = {tests: baseline(tests, copy) for tests in groups}
+        for number, mutation in tried:
             begun = time.monotonic()
             found = is_noticed(mutation, copy, PATIENCE * seconds[tests_of(mutation.file)])
             noticed += found
@@ -136,7 +139,7 @@ def main() -> None:
                 f"{mutation.file}:{mutation.line}\n      - {mutation.before.strip()}\n      + {mutation.after.strip()}",
                 flush=True,
             )
-    print(f"noticed {noticed} of {len(drawn)}")
+    print(f"noticed {noticed} of {len(tried)}")
 
 
 if __name__ == "__main__":

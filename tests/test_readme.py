@@ -31,8 +31,10 @@ def commands(program: str, language_blocks: list[str] | None = None) -> list[lis
 
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
-    """A folder with the project's configs, as a user's clone has them."""
+    """A folder with the project's configs and the scene of a page, as a user's clone has them."""
     (tmp_path / "conf").symlink_to(ROOT / "conf")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "contact").symlink_to(ROOT / "docs" / "contact")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     return tmp_path

@@ -60,8 +60,16 @@ def test_bounds_are_those_of_the_interpreter(operation, degree):
         assert inside < 1e-10
 
 
+@pytest.mark.parametrize("places", [[0, 1], [1, 1]])
+def test_at_most_one_number_is_added_to_each_entry(places):
+    function = graph_of(lambda y, z, M, N: aten.index_add(y, 0, torch.tensor(places), z[:2]), 0)
+    found = both(function, *random_boxes(120, 0), 1)
+    assert (found is None) == (places == [1, 1])
+    assert found is None or max(differences(*found)) < 1e-10
+
+
 @pytest.mark.parametrize(("low", "high"), [(-0.2, None), (None, 0.2), (-0.2, math.inf), (-math.inf, 0.2), (-0.2, 0.2)])
-def test_limits_on_one_side_are_those_of_the_interpreter(low, high):
+def test_limits_are_those_of_the_interpreter(low, high):
     sides = [None if side is None else torch.tensor(side, dtype=torch.float64) for side in (low, high)]
     function, boxes = graph_of(lambda y, z, M, N: aten.clamp.Tensor(y, *sides), 0), random_boxes(120, 0)
     forms, others = both(function, *boxes, 2)

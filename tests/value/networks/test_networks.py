@@ -17,12 +17,14 @@ from lyapnet.value.networks import (
     FCN,
     ICNN,
     NETWORKS,
+    CentredNetwork,
     ExpansionNetwork,
     IgnoringStates,
     PartiallyConvexNetwork,
     QuadraticForm,
     Scaling,
     StationaryNetwork,
+    Timeless,
 )
 from lyapnet.value.networks.anchored import GoalAnchor, TerminalAnchor
 from tests.problems import with_expansion
@@ -80,6 +82,8 @@ VALUES = {
     "terminal(goal(icnn))": lambda: terminal(GoalAnchor(ICNN(**SMALL))),
     "ignoring(fcn)": lambda: IgnoringStates(of_two(FCN), KEPT, 3),
     "ignoring(terminal(goal(partially convex)))": lambda: ignoring(),
+    "centred(fcn)": lambda: CentredNetwork(FCN(**SMALL), torch.tensor([0.3, -0.2, 0.1])),
+    "timeless(fcn)": lambda: Timeless(FCN(**SMALL)),
     "ignoring(user)": lambda: IgnoringStates(WithoutFormula(scaling=TWO), KEPT, 3),
 }
 
@@ -145,7 +149,7 @@ def test_time_derivative_against_finite_differences(network):
     V_t, _ = gradients(network, t, x)
     assert_close(V_t, differences(lambda t: network(t, x), t), rtol=1e-6, atol=1e-6)
     moves = not torch.allclose(V_t, differences(lambda t: network(t, x), t + 0.1), rtol=1e-6, atol=1e-6)
-    assert moves != isinstance(network, StationaryNetwork)
+    assert moves != isinstance(network, StationaryNetwork | Timeless)
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -107,9 +108,10 @@ def trains(arguments: list[str]) -> bool:
 def test_every_command_runs(workplace, capsys):
     trainings = [["train", *arguments] for arguments in filter(trains, commands("python train.py"))]
     assert len(trainings) >= 4
+    beyond_reach = FILES_OF_READERS if shutil.which("ffmpeg") else (*FILES_OF_READERS, ".mp4")
     with few_optima(12, 40, 20):
         for arguments in [*trainings, *commands("lyapnet")]:
-            if any(file in argument for argument in arguments for file in FILES_OF_READERS):
+            if any(file in argument for argument in arguments for file in beyond_reach):
                 continue
             if arguments[0] == "train":
                 write_if_shown(arguments[arguments.index("--config") + 1])

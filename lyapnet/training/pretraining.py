@@ -44,13 +44,9 @@ PACE_SHARE = 0.1  # share of these seconds after which the pace decides whether 
 MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
 NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
-MAX_ROUNDS = 8  # rounds of fitting at the states that the fitted law visits
 ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
-PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
 FAR_COST_RATIO = 1.003  # cost of the best law so far, relative to the optima, above which the law counts as far
-FAR_PATIENCE = 4  # the patience while the law is far
-FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while the law is far
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
@@ -60,17 +56,20 @@ NEIGHBOUR_TRUST_LIMIT = 1.0  # the same for deviations towards neighbours
 
 
 class Method(NamedTuple):
-    """The optimizer of a fit; pairs are for the first fit and for a further round, while the law is not far."""
+    """How V is fitted to optima, and then in rounds at the states that its law visits."""
 
     optimizer: Callable[..., torch.optim.Optimizer]
-    steps: tuple[int, int]
-    rate: tuple[float, float]  # largest learning rate
+    steps: tuple[int, int]  # of the first fit, and of a round
+    rate: tuple[float, float]  # largest learning rate of each
+    rounds: int  # at most
+    patience: tuple[int, int]  # rounds without gain after which the rounds stop, and the same while the law is far
+    far_steps_factor: int  # a round takes this many times as many steps while the law is far
 
 
 # With limits or other costs of controls, or limits of states, V_x has kinks. There a V fitted by Muon is accurate along
-# optimal trajectories but oscillates beside them, hence Adam.
-SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01))
-WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005))
+# optimal trajectories but oscillates beside them, hence Adam; and V may have cliffs, which many steps have to find.
+SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01), 4, (2, 2), 1)
+WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005), 8, (2, 4), 4)
 
 
 def method_for(problem: Problem) -> Method:
@@ -377,12 +376,9 @@ def fit(
 ) -> FitResult:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The rounds end after MAX_ROUNDS or ROUNDS_SECONDS, after PATIENCE rounds without gain, when the law costs at most
-    SUFFICIENT_COST_RATIO times the optima, or when another law of V costs less while half of the closed loops cost
-    POOR_COST_RATIO times their optimum. While the best law so far costs more than FAR_COST_RATIO times the optima, as
-    within tight limits of the controls, where V has cliffs, rounds take FAR_STEPS_FACTOR times as many steps, with
-    FAR_PATIENCE. The V with the cheapest law is kept. Where ROUNDS_SECONDS end the rounds, the result depends on the
-    machine.
+    The rounds end as the Method says, after ROUNDS_SECONDS, when the law costs at most SUFFICIENT_COST_RATIO times the
+    optima, or when another law of V costs less while half of the closed loops cost POOR_COST_RATIO times their optimum.
+    The V with the cheapest law is kept. Where ROUNDS_SECONDS end the rounds, the result depends on the machine.
 
     Args:
         report: called with each stage of the work.
@@ -395,11 +391,11 @@ def fit(
     sufficient_cost, far_cost = (optimal_cost + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, FAR_COST_RATIO))
     best_weights, best = copy.deepcopy(learner.V.state_dict()), LawCost(1.0, math.inf)
     rounds_without_gain, last_start = 0, math.inf
-    for k in range(MAX_ROUNDS + 1):
+    for k in range(method.rounds + 1):
         phase = min(k, 1)  # the first fit, or a further round
-        where = f" where its law leads ({k} of at most {MAX_ROUNDS} in {ROUNDS_SECONDS:.0f} s)" if k else ""
+        where = f" where its law leads ({k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
         stage = f"fitting V to {len(optimum.path.cost)} optima{where} within {FIT_SECONDS[phase]:.0f} s of work"
-        steps = method.steps[phase] * (FAR_STEPS_FACTOR if k and best.mean > far_cost else 1)
+        steps = method.steps[phase] * (method.far_steps_factor if k and best.mean > far_cost else 1)
         fitting.lower(examples, steps, method.rate[phase], FIT_SECONDS[phase], partial(report, stage))
         if k == 0:
             last_start = seconds_of_work() + ROUNDS_SECONDS
@@ -409,8 +405,8 @@ def fit(
         rounds_without_gain = 0 if has_gained else rounds_without_gain + 1
         if cost < best:
             best_weights, best = copy.deepcopy(learner.V.state_dict()), cost
-        patience = FAR_PATIENCE if best.mean > far_cost else PATIENCE
-        is_over = k == MAX_ROUNDS or seconds_of_work() > last_start
+        patience = method.patience[best.mean > far_cost]
+        is_over = k == method.rounds or seconds_of_work() > last_start
         if is_over or cost.mean <= sufficient_cost or rounds_without_gain >= patience:
             break
         if float(((path.cost - optimum.path.cost) / cost_sizes).median()) > POOR_COST_RATIO - 1:

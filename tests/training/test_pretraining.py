@@ -172,9 +172,11 @@ def test_a_fit_does_not_depend_on_the_pace_of_the_machine_unless_time_runs_out(p
 
 @pytest.mark.gate
 def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(swing, monkeypatch):
-    """At most MAX_ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
+    """At most so many times as the method says; what stays is the V whose law cost least, though it is not the last."""
     problem, seen, _ = swing
     shorten_fits(monkeypatch, 60, 30)  # what is decided by pretended costs does not need a good fit
+    smooth = pretraining.SMOOTH
+    monkeypatch.setattr(pretraining, "SMOOTH", pretraining.WITH_KINKS)
     given, costs = draw_examples(problem, seen, GENERATOR), list[float]()
     mean, led = float(seen.path.cost.mean()), Learner.path_from
 
@@ -224,11 +226,15 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     fitted(2, 1.5, 1.7, 1.6, 1.8, 1.9, 1)
     assert len(costs) == 6, "but not after four"
     kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1, 1.09, 1.08, 1.07, 1.0)
-    assert len(costs) == 1 + pretraining.MAX_ROUNDS
+    assert len(costs) == 1 + pretraining.WITH_KINKS.rounds
     assert kept == pytest.approx(costs[8], rel=1e-6)
     seconds_of_a_fit = 0.3 * pretraining.ROUNDS_SECONDS
     fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1, 1.0)
     assert len(costs) == 5, "the fourth round ends after the time for rounds, which begins after the first fit"
+    monkeypatch.setattr(pretraining, "SMOOTH", smooth)
+    seconds_of_a_fit = 0.0
+    fitted(2, 1.5, 1.7, 1.6, 1.2, 1)
+    assert steps == [60, 30, 30, 30], "without kinks neither longer rounds nor more patience"
 
 
 @pytest.mark.gate
@@ -280,7 +286,7 @@ def test_where_no_law_is_finite_a_fit_leaves_the_weights(swing, monkeypatch):
     problem, seen, _ = swing
     learner, x = learner_of(problem, 1.0), torch.randn(5, 2)
     before = learner.V(torch.zeros(()), x)
-    monkeypatch.setattr(pretraining, "MAX_ROUNDS", 1)
+    monkeypatch.setattr(pretraining, "SMOOTH", pretraining.SMOOTH._replace(rounds=1))
     diverging = path_under(problem, at_rest(problem), seen.path.x[0])
     diverging = diverging._replace(cost=diverging.cost * torch.inf)
     monkeypatch.setattr(Learner, "path_from", lambda *arguments: diverging)

@@ -12,6 +12,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims.certify import certify
 from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.kinds import LowerBound, Tube
+from lyapnet.claims.tubes import figures
 from lyapnet.claims.tubes.certificate import TubeCertificate
 from lyapnet.claims.two_sided import TwoSidedCertificate
 from lyapnet.cli import main
@@ -102,6 +103,14 @@ def test_words_formulas_and_figure_are_about_both(riccatis):
     shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert "proved: any control costs at least" in shown
     assert "from above / from below" in figure.get_suptitle()
+
+
+def test_optima_of_the_first_states_alone_are_drawn_beside_both_bounds(riccatis):
+    above = riccatis.above
+    least = above.inside.low, "any control"
+    figure = figures.tube(above.claim, above.controller, above.inside, above.inside.guaranteed[:3], "", least)
+    (optima,) = [line for line in figure.axes[-1].lines if line.get_label() == "optimum of the steps of Δt"]
+    assert len(optima.get_xdata()) == 3 < len(above.inside.x0)
 
 
 @pytest.mark.gate

@@ -3,8 +3,10 @@
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from lyapnet.base.drawing import BLUE, GREEN, GREY, VERMILION, legend_below, to_numpy
 from lyapnet.base.random_streams import CERTIFICATION, stream
@@ -14,10 +16,11 @@ from lyapnet.claims.tubes.tube import ProvedTube
 from lyapnet.controller.controller import Controller
 
 SHOWN = 12  # number of simulated closed loops in the figure
+OfFirstStates = Float[Tensor, " first"]  # a number for each of the first of some states
 
 
 def tube(
-    claim: ProvedTube, controller: Controller, inside: Inside, optimum: PerState | None, headline: str,
+    claim: ProvedTube, controller: Controller, inside: Inside, optimum: OfFirstStates | None, headline: str,
     least: tuple[PerState, str] | None = None,
 ) -> Figure:  # fmt: skip
     """Bounds of each state over time with some simulated closed loops; and relative bounds of the cost.
@@ -61,7 +64,7 @@ def _draw_state(panel: Axes, claim: ProvedTube, k: int, trajectory: Any, i: int)
         lines[0].set_label("some, simulated by steps of Δt")
 
 
-def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tuple[PerState, str] | None) -> None:
+def _draw_cost(panel: Axes, inside: Inside, optimum: OfFirstStates | None, least: tuple[PerState, str] | None) -> None:
     """Draw bounds and optima, divided by the middle of the bounds, over this middle; nothing without a proof."""
     panel.set(xlabel="cost from x₀, proved", ylabel="relative to it")
     lowest, highest = inside.low, inside.guaranteed

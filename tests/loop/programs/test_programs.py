@@ -14,12 +14,14 @@ from torch.testing import assert_close
 from lyapnet.base.errors import DivergenceError, UsageError
 from lyapnet.loop.programs import PROGRAMS, LyapunovProgram, Tolerances, ValueProgram
 from lyapnet.loop.programs.terms import (
+    MIN_COST_SHARE,
     cost_to_go_error,
     hinge,
     residual,
     satisfied,
     terminal_hinge,
     terminal_residual,
+    value_floored,
     violation,
 )
 from lyapnet.loop.programs.value import lost
@@ -408,3 +410,9 @@ def test_lost_trajectories_cost_far_more_than_V_and_not_merely_much():
     running = torch.stack([torch.zeros(3), cost])
     path = Trajectory(torch.arange(2.0), torch.zeros(2, 3, 1), torch.zeros(1, 3, 1), running, torch.zeros(3), values)
     assert lost(values, path).tolist() == [False, True, False]
+
+
+def test_relative_costs_have_no_denominator_near_zero():
+    value, cost = torch.tensor([-1.0, 0.0, 3.0]), torch.tensor([1.0, 2.0, 9.0])
+    least = 2 * MIN_COST_SHARE
+    assert_close(value_floored(value, cost), torch.tensor([least, least, 3.0]))

@@ -93,11 +93,14 @@ def with_option(arguments: list[str], name: str, value: str) -> list[str]:
 
 
 def write_if_shown(experiment: str) -> None:
-    """Write the YAML of an experiment that a page shows, unless the file exists."""
+    """Write the YAML of an experiment that a page shows, unless the file exists, and the classes that it names."""
     names = f"{Path(experiment).stem}.yaml", f"experiment: {Path(experiment).stem}\n"
     shown = [block for block in blocks("yaml") if any(name in block for name in names)]
     if shown and not Path(experiment).exists():
         Path(experiment).write_text(shown[0], encoding="utf-8")
+        for module, name in re.findall(r"(\w+):([A-Z]\w+)", shown[0]):
+            for source in [block for block in blocks("python") if f"class {name}(" in block]:
+                Path(f"{module}.py").write_text(source, encoding="utf-8")
 
 
 def trains(arguments: list[str]) -> bool:

@@ -340,3 +340,11 @@ def test_close_to_where_a_function_ends_nothing_is_lost(function):
         assert (values.max() <= high).all()
         known += int(high.isfinite().all())
     assert known > 20
+
+
+@pytest.mark.filterwarnings("ignore:Sparse CSR tensor support is in beta")
+def test_a_sparse_constant_is_bounded_as_a_dense_one():
+    dense, box = torch.eye(2).double(), taylor.box_form(torch.zeros(3, 2).double(), torch.ones(3, 2).double())
+    sparse, same = (taylor.constant_form(value, box).interval() for value in (dense.to_sparse_csr(), dense))
+    assert all(torch.equal(side, other) for side, other in zip(sparse, same, strict=True))
+    assert all(torch.allclose(side, dense, rtol=0, atol=1e-12) for side in sparse)

@@ -18,7 +18,7 @@ from tests.fits import few_optima, shorten_fits
 from tests.pages import PAGES, README, REPORT, ROOT, blocks
 from tests.problems import problem_of
 
-FILES_OF_READERS = ("logs/arm/", "V.onnx")  # which pages name, but do not make
+FILES_OF_READERS = ("logs/arm/", "V.onnx", "task.yaml")  # which pages name, but do not make
 SHORT = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4"]
 
 
@@ -77,6 +77,8 @@ def brief(arguments: list[str]) -> list[str]:
     if arguments[0] != "bench":
         return arguments
     first = [a.split(",")[0] for a in arguments]  # of several tasks and routes
+    if arguments[1] == "optima":
+        return [*first, "horizon.steps=4"]
     return [
         *with_option(with_option(first, "--batch", "2"), "--repeats", "1"),
         "horizon.steps=4",

@@ -20,6 +20,7 @@ from lyapnet.experiment.assembly import (
     build_rollout,
     build_value_function,
     default_of,
+    without_unread_settings,
 )
 from lyapnet.experiment.checkpoint import AFTER_HORIZON, KEY, read_checkpoint
 from lyapnet.experiment.config import Config, config_from_plain
@@ -143,7 +144,7 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
             raise UsageError(f"Expected a config, got {type(plain).__name__}; use another checkpoint.")
         if "${" in json.dumps(plain, ensure_ascii=False):  # resolving it may read the environment, or call a function
             raise UsageError("Expected plain values, got an interpolation ${…}; use another checkpoint.")
-        return config_from_plain(plain)
+        return without_unread_settings(config_from_plain(plain))
     except UsageError as error:
         raise CheckpointError(
             f"Expected a checkpoint of this version of lyapnet, got {str(path)!r}: {error}"

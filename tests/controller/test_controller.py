@@ -15,11 +15,12 @@ from lyapnet.base.errors import CheckpointError, DivergenceError, UsageError
 from lyapnet.base.random_streams import TEST, stream
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
+from lyapnet.controller.loading import config_of
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
 from lyapnet.experiment.checkpoint import AFTER_HORIZON, KEY, read_checkpoint, write_checkpoint
-from lyapnet.experiment.config import Config, load_config
+from lyapnet.experiment.config import Config, load_config, to_plain
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.systems import DoubleIntegrator, Linear
 from lyapnet.value.after_horizon import LAWS, AfterHorizon
@@ -87,6 +88,19 @@ def test_controller_of_parts_has_no_config():
     assert controller.parameters == {}
     with pytest.raises(UsageError, match="Expected a controller that a run left, got one made from parts"):
         _ = controller.config
+
+
+def test_what_runs_of_earlier_versions_ignored_is_left_out_of_their_config():
+    """A config with such a setting is refused; their checkpoints are read, and resumed without it."""
+    config = load_config(CONF / "double_integrator.yaml", ["cost.name=own:Price", "cost.Q=null", "cost.R=null"])
+    config.cost.Q_T = None
+    plain = to_plain(config)
+    plain["system"] |= {"title": "Sledge", "angles": ["velocity"]}
+    plain["cost"] |= {"Q": [1, 1], "periodic": ["position"]}
+    assert config_of({KEY: {"config": plain}}, "last.ckpt") == config
+    for name in ("double_integrator", "pushing"):
+        config = load_config(CONF / f"{name}.yaml")
+        assert config_of({KEY: {"config": to_plain(config)}}, "last.ckpt") == config, "what is read stays"
 
 
 def test_loaded_value_function_is_the_trained_one(controller, path):

@@ -1,6 +1,14 @@
 """Builds the objects of a config."""
 
-from lyapnet.experiment.assembly.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
+from lyapnet.experiment.assembly.classes import (
+    DTYPES,
+    REGISTRIES,
+    Parts,
+    default_of,
+    own_parts,
+    resolve,
+    without_unread_settings,
+)
 from lyapnet.experiment.assembly.entries import entry_per_state
 from lyapnet.experiment.assembly.family import is_in_range, member, ranges_of
 from lyapnet.experiment.assembly.learner import build_program, build_rollout, build_value_function
@@ -31,4 +39,5 @@ __all__ = [
     "ranges_of",
     "resolve",
     "with_parameters",
+    "without_unread_settings",
 ]

@@ -5,7 +5,7 @@ import inspect
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,12 +100,32 @@ def class_of(options: Any, part: str) -> Any:
     """
     registry, base = REGISTRIES[part]
     cls = resolve(options.name, registry, f"{part}.name", base)
-    reader, keys = SETTINGS_OF_ONE_CLASS.get(part, (cls, ()))
-    for key in keys if cls is not reader else ():
-        if getattr(options, key) not in (None, "", [], {}):
-            advice = f"remove it, or choose another {part}.name"
-            raise UsageError(f"Expected no {part}.{key} with {part}.name={options.name}, got one; {advice}.")
+    if unread := unread_settings(options, part):
+        raise UsageError(
+            f"Expected no {part}.{unread[0]} with {part}.name={options.name}, got one; remove it, or choose another "
+            f"{part}.name."
+        )
     return class_of_equations(options) if cls is EquationSystem else cls
+
+
+def unread_settings(options: Any, part: str) -> list[str]:
+    """The keys of the settings that a section has, but the class that it names does not read."""
+    reader, keys = SETTINGS_OF_ONE_CLASS.get(part, (None, ()))
+    if REGISTRIES[part][0].get(options.name) is reader:
+        return []
+    return [key for key in keys if getattr(options, key) not in (None, "", [], {})]
+
+
+def without_unread_settings(config: Config) -> Config:
+    """A config without the settings that 0.3 ignored and `class_of` refuses."""
+    sections = {part: getattr(config, part) for part in SETTINGS_OF_ONE_CLASS}
+    return replace(
+        config,
+        **{
+            part: replace(options, **{key: getattr(type(options)(), key) for key in unread_settings(options, part)})
+            for part, options in sections.items()
+        },
+    )
 
 
 def class_of_equations(options: SystemConfig) -> type[EquationSystem]:

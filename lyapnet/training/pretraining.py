@@ -46,7 +46,9 @@ NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookah
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
-FAR_COST_RATIO = 1.003  # cost of the best law so far, relative to the optima, above which the law counts as far
+PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
+FAR_PATIENCE = 4  # the same while the best law so far is far from the optima
+FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while it is
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
@@ -62,14 +64,13 @@ class Method(NamedTuple):
     steps: tuple[int, int]  # of the first fit, and of a round
     rate: tuple[float, float]  # largest learning rate of each
     rounds: int  # at most
-    patience: tuple[int, int]  # rounds without gain after which the rounds stop, and the same while the law is far
-    far_steps_factor: int  # a round takes this many times as many steps while the law is far
+    far_cost_ratio: float  # cost of the best law so far, relative to the optima, above which the law counts as far
 
 
 # With limits or other costs of controls, or limits of states, V_x has kinks. There a V fitted by Muon is accurate along
 # optimal trajectories but oscillates beside them, hence Adam; and V may have cliffs, which many steps have to find.
-SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01), 4, (2, 2), 1)
-WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005), 8, (2, 4), 4)
+SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01), rounds=4, far_cost_ratio=math.inf)
+WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005), rounds=8, far_cost_ratio=1.003)
 
 
 def method_for(problem: Problem) -> Method:
@@ -376,9 +377,10 @@ def fit(
 ) -> FitResult:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The rounds end as the Method says, after ROUNDS_SECONDS, when the law costs at most SUFFICIENT_COST_RATIO times the
-    optima, or when another law of V costs less while half of the closed loops cost POOR_COST_RATIO times their optimum.
-    The V with the cheapest law is kept. Where ROUNDS_SECONDS end the rounds, the result depends on the machine.
+    The rounds end after those of the Method or ROUNDS_SECONDS, after PATIENCE rounds without gain, when the law costs
+    at most SUFFICIENT_COST_RATIO times the optima, or when another law of V costs less while half of the closed loops
+    cost POOR_COST_RATIO times their optimum. The V with the cheapest law is kept. Where ROUNDS_SECONDS end the rounds,
+    the result depends on the machine.
 
     Args:
         report: called with each stage of the work.
@@ -388,14 +390,14 @@ def fit(
     later_states, method, gain_of_other = stream(learner.seed, START, 12), fitting.method, 0.0
     optimal_cost, cost_sizes = float(optimum.path.cost.mean()), sizes(learner.problem, optimum.path.cost)
     size = float(cost_sizes.mean())
-    sufficient_cost, far_cost = (optimal_cost + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, FAR_COST_RATIO))
+    sufficient_cost, far_cost = (optimal_cost + (r - 1) * size for r in (SUFFICIENT_COST_RATIO, method.far_cost_ratio))
     best_weights, best = copy.deepcopy(learner.V.state_dict()), LawCost(1.0, math.inf)
-    rounds_without_gain, last_start = 0, math.inf
+    is_far, rounds_without_gain, last_start = False, 0, math.inf
     for k in range(method.rounds + 1):
         phase = min(k, 1)  # the first fit, or a further round
         where = f" where its law leads ({k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
         stage = f"fitting V to {len(optimum.path.cost)} optima{where} within {FIT_SECONDS[phase]:.0f} s of work"
-        steps = method.steps[phase] * (method.far_steps_factor if k and best.mean > far_cost else 1)
+        steps = method.steps[phase] * (FAR_STEPS_FACTOR if is_far else 1)
         fitting.lower(examples, steps, method.rate[phase], FIT_SECONDS[phase], partial(report, stage))
         if k == 0:
             last_start = seconds_of_work() + ROUNDS_SECONDS
@@ -405,9 +407,9 @@ def fit(
         rounds_without_gain = 0 if has_gained else rounds_without_gain + 1
         if cost < best:
             best_weights, best = copy.deepcopy(learner.V.state_dict()), cost
-        patience = method.patience[best.mean > far_cost]
+        is_far = best.mean > far_cost
         is_over = k == method.rounds or seconds_of_work() > last_start
-        if is_over or cost.mean <= sufficient_cost or rounds_without_gain >= patience:
+        if is_over or cost.mean <= sufficient_cost or rounds_without_gain >= (FAR_PATIENCE if is_far else PATIENCE):
             break
         if float(((path.cost - optimum.path.cost) / cost_sizes).median()) > POOR_COST_RATIO - 1:
             gain_of_other = gain_of_another_law()

@@ -202,8 +202,7 @@ def interval_form(lower: Corners, upper: Corners) -> TaylorForm:
 def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
     """A value that does not depend on the point, as a form with the boxes and the ε of `like`."""
     boxes = len(like.radius)
-    value = value if value.layout == torch.strided else value.to_dense()
-    center = value.to(like.radius.dtype).expand(boxes, *value.shape)
+    center = value.to_dense().to(like.radius.dtype).expand(boxes, *value.shape)
     coefficients = torch.zeros(len(like.terms) - 1, *center.shape, dtype=center.dtype)
     return like.with_parts(torch.cat([center[None], coefficients]), torch.zeros_like(center))
 

@@ -43,7 +43,7 @@ def outside(function, boxes=12, points=12):
                 continue
             for (low, high), value in zip(bounds, values, strict=True):
                 known = low[k].isfinite() & high[k].isfinite()
-                dense = value if value.layout == torch.strided else value.to_dense()
+                dense = value.to_dense()
                 count += int((known & ~((low[k] <= dense) & (dense <= high[k]))).sum())
     return count
 

@@ -2,18 +2,22 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_lyapunov
+from torch import nn
 
 from lyapnet.base.errors import UsageError
+from lyapnet.base.interpolation import Curve
 from lyapnet.claims.certify import certify
 from lyapnet.claims.kinds import Tube
 from lyapnet.claims.tubes import enclosure
 from lyapnet.claims.tubes.certificate import TubeCertificate
 from lyapnet.claims.tubes.coordinates import Moving, bound_in_new_frame, bound_turn, ratio_of_errors
+from lyapnet.claims.tubes.field import Field
 from lyapnet.claims.tubes.tube import prove_tube
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
@@ -232,6 +236,12 @@ def test_without_the_bounds_they_would_be(monkeypatch):
     monkeypatch.setattr(enclosure._Tube, "_bound_defect", careless)
     about = controller(Swinging(), Formula(damped))
     assert outside(prove_tube(about, Budget(20)), about)[0] > 0
+
+
+def test_steps_end_where_the_law_may_have_a_kink():
+    """At the nodes of its curves, and Δt earlier, when a sampled law reads V(t + Δt, ·)."""
+    loop = nn.ModuleList([Curve(torch.tensor([0.0, 0.5, 1.0]), torch.zeros(3))])
+    assert Field.kinks(SimpleNamespace(loop=loop), 1.0, 0.125) == [0.375, 0.5, 0.875]
 
 
 def test_the_certificate_and_its_figure(swung):

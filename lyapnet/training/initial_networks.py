@@ -13,8 +13,8 @@ from lyapnet.loop.programs.terms import costs_to_go
 from lyapnet.task.cost import is_quadratic_about_target
 from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
+from lyapnet.training.examples import typical_cost
 from lyapnet.training.learner import Learner
-from lyapnet.training.pretraining import typical_cost
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import (
     Expansion,

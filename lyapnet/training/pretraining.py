@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -12,37 +12,33 @@ from torch import Tensor, nn
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.random_streams import START, stream
 from lyapnet.base.threads import seconds_of_work
-from lyapnet.base.types import Control, PerState, State, StatePath
 from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
 from lyapnet.task.problem import Problem
-from lyapnet.task.sets import Unbounded
-from lyapnet.training.later_optima import TIMES, later_optima
+from lyapnet.training.disturbed_loops import disturbed_path
+from lyapnet.training.examples import (
+    MIN_VALUE_SHARE,
+    Examples,
+    best_control_of_fit,
+    examples_beyond,
+    examples_visited,
+    later_examples,
+    looks_ahead,
+    seeks_later_optima,
+    select_finite,
+    unknown_states,
+)
 from lyapnet.training.learner import Learner
-from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
 from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.calculus import ValueFunction
-from lyapnet.value.expansions import (
-    FLOOR,
-    Optimum,
-    Path,
-    derivatives_of,
-    held_control,
-    in_float64,
-    penalty_of_one_step,
-    sizes,
-    step_objective,
-    without_penalty,
-)
-from lyapnet.value.policy import LookaheadPolicy
+from lyapnet.value.expansions import Optimum, sizes
 
 BATCH_SIZE = 512  # examples in a step
 BRIEF_STEPS = 200  # steps of a brief fit, which compares initial values of V
 FIT_SECONDS = 60.0, 30.0  # seconds of work for the first fit and for each further round, at most
 PACE_SHARE = 0.1  # share of these seconds after which the pace decides whether the learning rate falls by time instead
 MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
-NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
@@ -51,10 +47,13 @@ FAR_PATIENCE = 4  # the same while the best law so far is far from the optima
 FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while it is
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
-MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
-MIN_OPTIMA = 32  # with fewer, states beyond them outweigh those along them
-TRUST_LIMIT = 0.01  # largest ½ δᵀ|H|δ relative to J for which an expansion is used at a deviation δ
-NEIGHBOUR_TRUST_LIMIT = 1.0  # the same for deviations towards neighbours
+MAX_WIDENED_EXCESS = 0.05  # excess cost of a law up to which V is also fitted where it leads on other plants
+DISTURBED_TIMES = tuple(k / 7 for k in range(7))  # shares of the horizon at which optima begin there
+DISTURBED_ROUNDS = 3  # largest number of fits to such optima
+DISTURBED_STEPS_FACTOR = 2  # each takes this many times the steps of the first fit
+TRIED_OPTIMA = 8  # such optima at each time, at which it is seen whether V needs a fit
+MAX_DISTURBED_EXCESS = 0.05  # mean relative excess cost there, above which it does
+MAX_LOSS = 0.01  # relative cost that the law may lose on the model by a fit; training regains it
 
 
 class Method(NamedTuple):
@@ -95,221 +94,6 @@ class LawCost(NamedTuple):
     mean: float  # of J, infinite if a loop is lost
 
 
-class Examples(NamedTuple):
-    """Data of V on optimal trajectories and near them, one row for each of k states."""
-
-    t: Tensor  # t_n (k,)
-    x: State
-    value: PerState  # V(t_n, x_n)
-    after: Tensor  # t_{n+1}
-    about: Control  # c, the reference control: at F(x, c) the law evaluates V; the control at rest or the best one
-    led: State  # F(x_n, c), the next state under c
-    by_control: Tensor  # B (k, n, m), F_u/Δt there
-    slope: Control  # ℓ_u there
-    weight: Tensor  # W (k, m, m), ℓ_uu + Δt BᵀHB
-    best: Control  # the minimiser of ½ (u − c)ᵀW(u − c) + bᵀ(u − c) over U, b = BᵀV_x + ℓ_u
-    cost: PerState  # scale of errors of V: J of the trajectory, at least the median J of all
-    rate: PerState  # scale of the excess cost per second: `cost` divided by T
-
-    def concatenated_with(self, others: "Examples") -> "Examples":
-        """Concatenation with other examples of the same problem."""
-        return Examples(*(torch.cat(both) for both in zip(self, others, strict=True)))
-
-    def each(self, change: Callable[[Tensor], Tensor]) -> "Examples":
-        """Apply a function to every column."""
-        return Examples(*map(change, self))
-
-    def to(self, like: Tensor) -> "Examples":
-        """Convert to the precision and device of a tensor."""
-        return self.each(lambda column: column.to(like))
-
-
-def draw_examples(problem: Problem, optimum: Optimum, generator: torch.Generator, ahead: bool = False) -> Examples:
-    """The examples of the finite trajectories, in float64: one row at each node, and one at a state near it.
-
-    The nearby state deviates towards a neighbouring trajectory, by at most half the distance to it at that time or
-    earlier; its V and V_x are those of the expansion. A law fitted on optimal trajectories alone may leave them.
-
-    Args:
-        ahead: whether the law to be fitted is the lookahead law.
-    """
-    optimum = _select_finite(optimum)
-    drawn = _draw_deviations(optimum.expansion.x, generator)
-    if problem.horizon.stationary:  # its V has the goal of the end of a range for each parameter beyond it
-        drawn = _within_ranges(problem, optimum.expansion.x[:-1], drawn)
-    near = _limit_deviations(problem, optimum, drawn, NEIGHBOUR_TRUST_LIMIT)
-    return _build_examples(problem, optimum, [torch.zeros_like(near), near], ahead)
-
-
-def examples_visited(problem: Problem, optimum: Optimum, path: Path, ahead: bool = False) -> Examples:
-    """Examples at the states that a law visits from the initial states of the optima, with V from their expansions.
-
-    The law of the fitted V leaves the states of the fit, in directions in which V was not determined. Fitting also at
-    the states that this law visits closes the gap (dataset aggregation). States too far from the optimum for its
-    expansion are moved closer.
-
-    Source: Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
-    learning", AISTATS 2011.
-    """
-    optimum = _select_finite(optimum)
-    deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    return _build_examples(problem, optimum, [_limit_deviations(problem, optimum, deviation, TRUST_LIMIT)], ahead)
-
-
-def examples_beyond(
-    learner: Learner, optimum: Optimum, path: Path, generator: torch.Generator, progress: Callable[[int, int], None]
-) -> list[Examples]:
-    """Examples along new optima from states at which costly closed loops have left the known ones; see later_optima."""
-    problem, ahead = learner.problem, looks_ahead(learner)
-    if problem.horizon.stationary or len(optimum.path.cost) < MIN_OPTIMA:
-        return []
-    deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    is_known = _trusted_share(problem, optimum, deviation, TRUST_LIMIT) >= 1
-    found = later_optima(problem, optimum, path, is_known, generator, FIT_SECONDS[1] / len(TIMES), progress)
-    examples, least = list[Examples](), typical_cost(sizes(problem, optimum.path.cost))
-    for node, later, optima in found:
-        own, began = draw_examples(later, optima, generator, ahead), node * problem.horizon.dt
-        cost = own.cost.clamp_min(least)
-        examples.append(
-            own._replace(t=own.t + began, after=own.after + began, cost=cost, rate=cost / problem.horizon.duration)
-        )
-    return examples
-
-
-def _limit_deviations(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
-    """Scale down deviations δ (N, b, n) for which ½ δᵀ|H|δ is more than a share of the cost."""
-    return _trusted_share(problem, optimum, deviation, share)[..., None] * deviation
-
-
-def _trusted_share(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> Tensor:
-    """The factor (N, b) ≤ 1 of deviations δ (N, b, n) with which ½ δᵀ|H|δ is at most a share of the cost."""
-    values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
-    quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
-    ratio = share * _error_scale(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
-    return ratio.sqrt().clamp_max(1)
-
-
-def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
-    """The rows at some deviations (N, b, n) from the finite trajectories; rows with non-finite entries are left out."""
-    problem, optimum = in_float64(problem), _select_finite(optimum)
-    blocks = [
-        _example_columns(problem, optimum, each, about_best)
-        for each in deviations
-        for about_best in _reference_controls_are_best(problem, ahead)
-    ]
-    examples = Examples(*map(torch.cat, zip(*blocks, strict=True)))
-    defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
-    return examples.each(lambda column: column[defined])
-
-
-def _reference_controls_are_best(problem: Problem, ahead: bool) -> Sequence[bool]:
-    """For each row of a state, whether its reference control is the best control or the control at rest.
-
-    The lookahead law searches from the control at rest to the best one, so V has to be accurate at both. With
-    constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one
-    step itself, so rows at the best control are sufficient.
-    """
-    if not ahead or not problem.system.affine:  # the search of the latter does not begin anew with V
-        return [ahead]
-    return [True] if problem.constraints is not None else [False, True]
-
-
-def _select_finite(optimum: Optimum) -> Optimum:
-    return optimum.member(optimum.path.cost.isfinite())
-
-
-def _error_scale(problem: Problem, optimum: Optimum) -> Tensor:
-    """The scale of errors of V at each node but the last, (N, b).
-
-    It is the cost of the trajectory, at least the median of all. For a stationary V it is the value at that state, so
-    that V is accurate near the goal too, at least MIN_VALUE_SHARE of the cost.
-    """
-    size = sizes(problem, optimum.path.cost)
-    costs = size.clamp_min(typical_cost(size)).expand(len(optimum.path.u), -1)
-    return optimum.expansion.value[:-1].maximum(MIN_VALUE_SHARE * costs) if problem.horizon.stationary else costs
-
-
-def typical_cost(cost: PerState) -> float:
-    """The median of some costs, or their mean if the median is zero."""
-    return float(cost.median()) or float(cost.mean())
-
-
-def _draw_deviations(x: StatePath, generator: torch.Generator) -> Tensor:
-    """Random deviations (N, b, n) at all nodes but the last, each up to half an earlier difference to a neighbour."""
-    nodes, b = len(x) - 1, x.shape[1]
-    if b == 1:
-        return torch.zeros_like(x[:-1])
-    every, node = torch.arange(b), torch.arange(nodes)[:, None]
-    near = nearest(x[0], x[0], itself=False)
-    neighbour = near[every, torch.randint(near.shape[1], (nodes, b), generator=generator)]
-    before = (node * torch.rand(nodes, b, generator=generator)).long()
-    share = torch.rand(nodes, b, 1, generator=generator, dtype=x.dtype) - 0.5
-    return share * (x[before, neighbour] - x[before, every])
-
-
-def _within_ranges(problem: Problem, x: StatePath, deviation: Tensor) -> Tensor:
-    """The deviations from x without what leads a constant state out of its range in X₀."""
-    box, constants = problem.initial_states, list(problem.system.constants)
-    if not constants:
-        return deviation
-    low, high = (side.to(x)[constants] - x[..., constants] for side in (box.lower, box.upper))
-    within = deviation.clone()
-    within[..., constants] = deviation[..., constants].maximum(low).minimum(high)
-    return within
-
-
-def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:
-    """The columns of the examples at given deviations from the nodes of some optima.
-
-    The reference control is the best control or the control at rest. For a system that is not affine it is the best
-    one, as W says nothing of others, though V is evaluated where the law evaluates it. The constraint penalty of one
-    step is not quadratic; its exact value is used.
-    """
-    (x, value, gradient, hessian), dt = without_penalty(problem, optimum.expansion), problem.horizon.dt
-    now, H = x[:-1] + deviation, hessian[1:]
-    here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
-    here = here + penalty_of_one_step(problem, now)[0]
-    floor = 2 * FLOOR * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1]
-
-    def responses(about: Control) -> tuple[State, Tensor, Control, Tensor, Control]:
-        """(F, B, ℓ_u, W) at a control, and the best control by the second order expansion there."""
-        answer = problem.response(now, about)
-        _, slope, bend = penalty_of_one_step(problem, answer.x)
-        B = answer.by_control
-        W = _raise_eigenvalues(answer.curvature + dt * B.mT @ (H + bend) @ B, floor)
-        b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
-        return answer.x, B, answer.slope, W, _best_control_of_fit(problem, W / 2, b - apply(W, about))
-
-    if problem.system.affine:
-        about = problem.rest_at(now)
-        led, B, slope, W, best = responses(about)
-        for _ in range(NEWTON_STEPS if about_best else 0):
-            about = best
-            led, B, slope, W, best = responses(about)
-    else:
-        free = problem.response(now)
-        _, slope, bend = penalty_of_one_step(problem, free.x)
-        V_x, V_xx = gradient[1:] + apply(H, free.x - x[1:]) + slope, H + bend
-        about = best = held_control(problem, now, free, V_x, V_xx)
-        W = _raise_eigenvalues(derivatives_of(step_objective(problem, now, free, V_x, V_xx), best)[1], floor)
-        answer = problem.response(now, best)
-        B, slope, led = answer.by_control, answer.slope, answer.x
-        if not about_best:  # the law evaluates V where the nominal control leads
-            slope, led = slope + apply(B.mT, apply(V_xx, led - free.x)), free.x
-    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _error_scale(problem, optimum)
-    rate = cost / problem.horizon.duration
-    if problem.horizon.stationary:
-        rate = rate.maximum(-value.diff(dim=0) / dt)
-    columns = (t[:-1], now, here, t[1:], about, led, B, slope, W, best, cost, rate)
-    return [y.flatten(0, 1).detach() for y in columns]
-
-
-def _raise_eigenvalues(matrix: Tensor, floor: Tensor) -> Tensor:
-    """Symmetric matrices with all eigenvalues raised to at least a floor."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
-
-
 def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tensor, Tensor]:
     """The mean squared value error (V − V*)²/J², and the mean excess cost T/J (Q(u*) − min over u ∈ U of Q(u)).
 
@@ -323,7 +107,7 @@ def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tens
     t, x, value, after, about, led, B, slope, W, best, cost, rate = examples
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = _best_control_of_fit(problem, W / 2, b - apply(W, about))
+        u = best_control_of_fit(problem, W / 2, b - apply(W, about))
         besides = problem.cost.beside(best) - problem.cost.beside(u)
     excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1) + besides  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
@@ -341,14 +125,6 @@ class _Misfit(nn.Module):
         (problem,) = self._problem
         value_error, excess = errors(self.V, Examples(*columns), problem)
         return VALUE_WEIGHT * value_error + excess
-
-
-def _best_control_of_fit(problem: Problem, W: Tensor, b: Control) -> Control:
-    """argmin of uᵀWu + bᵀu + s(u) over U, or over ℝᵐ for a stationary V.
-
-    A stationary V has to decrease wherever u is; without limits its slope is fitted at the limits of u too.
-    """
-    return problem.cost.best_control(Unbounded() if problem.horizon.stationary else problem.controls, W, b)
 
 
 def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:
@@ -386,7 +162,7 @@ def fit(
         report: called with each stage of the work.
         gain_of_another_law: the relative cost that another law of the current V saves, 0 if it does not save enough.
     """
-    fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _select_finite(optimum)
+    fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), select_finite(optimum)
     later_states, method, gain_of_other = stream(learner.seed, START, 12), fitting.method, 0.0
     optimal_cost, cost_sizes = float(optimum.path.cost.mean()), sizes(learner.problem, optimum.path.cost)
     size = float(cost_sizes.mean())
@@ -415,18 +191,58 @@ def fit(
             gain_of_other = gain_of_another_law()
             if gain_of_other:
                 break
-        examples = examples.concatenated_with(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
+        visited = examples_visited(learner.problem, optimum, path, looks_ahead(learner))
         searching = partial(report, "optima from states where its law leads")
-        for later in examples_beyond(learner, optimum, path, later_states, searching):
-            examples = examples.concatenated_with(later)
+        examples = examples.concatenated_with(
+            visited, *examples_beyond(learner, optimum, path, later_states, searching)
+        )
     learner.V.load_state_dict(best_weights)
     excess = math.inf if best.share_lost else (best.mean - optimal_cost) / size
+    if not gain_of_other and excess <= MAX_WIDENED_EXCESS and seeks_later_optima(learner.problem, optimum):
+        excess = _fit_on_other_plants(learner, fitting, optimum, examples, report, excess)
     return FitResult(excess, gain_of_other)
 
 
-def looks_ahead(learner: Learner) -> bool:
-    """Whether the learner's law is the lookahead law, which evaluates V at the state that its own control reaches."""
-    return isinstance(learner.rollout.closed_loop.policy, LookaheadPolicy)
+def _fit_on_other_plants(
+    learner: Learner, fitting: "_Fit", optimum: Optimum, examples: Examples, report: StageReport, excess: float
+) -> float:
+    """Fit V also to optima from states where its law leads on other plants and from beyond X₀; see disturbed_path.
+
+    V is optimal there for the model: its law then meets a plant that differs as well as the model's optimal feedback.
+    The fits end when that of the round before holds at new such states, or when the law has become worse on the model.
+
+    Args:
+        excess: relative excess cost of the law on the model.
+
+    Returns:
+        the excess of the law that is kept.
+    """
+    generator, problem = stream(learner.seed, START, 13), learner.problem
+    mean_size = float(sizes(problem, optimum.path.cost).mean())
+    searching = partial(report, "optima from states where its law leads on other plants")
+    for k in range(DISTURBED_ROUNDS):
+        path = disturbed_path(learner, optimum.path, generator)
+        starts = unknown_states(problem, optimum, path, path.cost.isfinite(), DISTURBED_TIMES, generator)
+        few, rest = (
+            {k: rows[part] for k, rows in starts.items()} for part in (slice(TRIED_OPTIMA), slice(TRIED_OPTIMA, None))
+        )
+        new = later_examples(learner, optimum, path, few, generator, searching)
+        if not new or fitting.excess_at(new[0].concatenated_with(*new[1:])) <= MAX_DISTURBED_EXCESS:
+            break
+        visited = examples_visited(problem, optimum, path, looks_ahead(learner))
+        new += later_examples(learner, optimum, path, rest, generator, searching)
+        examples = examples.concatenated_with(visited, *new)
+        before = copy.deepcopy(learner.V.state_dict())
+        stage = f"fitting V where its law leads on other plants ({k + 1} of at most {DISTURBED_ROUNDS})"
+        steps = DISTURBED_STEPS_FACTOR * fitting.method.steps[0]
+        fitting.lower(examples, steps, fitting.method.rate[1], FIT_SECONDS[1], partial(report, stage))
+        cost = learner.path_from(optimum.path.x[0]).cost
+        now = float((cost - optimum.path.cost).mean()) / mean_size
+        if not now <= excess + MAX_LOSS:
+            learner.V.load_state_dict(before)
+            break
+        excess = now
+    return excess
 
 
 def fit_briefly(learner: Learner, examples: Examples) -> None:
@@ -444,11 +260,17 @@ class _Fit:
     """
 
     def __init__(self, learner: Learner, examples: Examples, generator: torch.Generator):
+        self._V, self._problem = learner.V, learner.problem
         self._trained, self._generator = trained_of(learner.V), generator
         some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH_SIZE).long()])
         loss = _Misfit(learner.V, learner.problem)
         self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
         self.method = method_for(learner.problem)
+
+    @torch.no_grad()
+    def excess_at(self, examples: Examples) -> float:
+        """The mean relative excess cost of the law of V at some examples."""
+        return float(errors(self._V, examples.to(self._trained[0]), self._problem)[1])
 
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]

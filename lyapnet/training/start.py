@@ -15,18 +15,15 @@ from lyapnet.base.types import State
 from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import MIN_LOOKAHEAD_GAIN, ZERO_VALUE, Candidate, Start
+from lyapnet.training.examples import MIN_OPTIMA, Examples, draw_examples, looks_ahead
 from lyapnet.training.initial_networks import network_of, raise_to_costs, start_from, start_from_zero
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
 from lyapnet.training.pretraining import (
-    MIN_OPTIMA,
     NOT_FITTED,
-    Examples,
     FitResult,
-    draw_examples,
     fit,
     fit_briefly,
-    looks_ahead,
     misfit,
     relative_misfit,
 )

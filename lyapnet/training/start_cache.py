@@ -25,7 +25,7 @@ from lyapnet.training.start import choose_start, has_place_for_start
 from lyapnet.value.expansions import in_float64
 from lyapnet.value.linearisation import Missing
 
-VERSION = 18  # of the search; increase it when the search changes
+VERSION = 19  # of the search; increase it when the search changes
 
 
 class StartCache:

@@ -14,10 +14,12 @@ from lyapnet.task.constraints import StateLimits
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import ControlBox
 from lyapnet.task.systems import Linear, Pendulum
+from lyapnet.training import examples as of_optima
 from lyapnet.training import pretraining
+from lyapnet.training.examples import draw_examples, examples_visited
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
-from lyapnet.training.pretraining import draw_examples, errors, examples_visited, fit
+from lyapnet.training.pretraining import errors, fit
 from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import SampledPolicy
@@ -277,7 +279,7 @@ def test_near_states_are_no_further_than_their_expansion_is_believed(swing, monk
         return float(((moved**2 * values.abs()).sum(-1) / 2 / cost).max())
 
     anyhow = furthest()
-    monkeypatch.setattr(pretraining, "NEIGHBOUR_TRUST_LIMIT", anyhow / 5)
+    monkeypatch.setattr(of_optima, "NEIGHBOUR_TRUST_LIMIT", anyhow / 5)
     assert furthest() == pytest.approx(anyhow / 5)
 
 

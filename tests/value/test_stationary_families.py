@@ -16,7 +16,7 @@ from lyapnet.task.cost import RegulatorTail
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.build_learner import build_pointwise
-from lyapnet.training.pretraining import draw_examples
+from lyapnet.training.examples import draw_examples
 from lyapnet.value.calculus import gradients
 from lyapnet.value.expansions import greedy_law, optimal_trajectories, path_under, riccati
 from lyapnet.value.networks import StationaryNetwork
@@ -272,7 +272,7 @@ def test_examples_beside_optima_are_of_members_within_the_ranges(monkeypatch):
     low, high = 0.25 - 1e-12, 0.45 + 1e-12
     p = draw_examples(problem, optimum, torch.Generator().manual_seed(0)).x[:, 2]
     assert bool(((low <= p) & (p <= high)).all())
-    monkeypatch.setattr("lyapnet.training.pretraining._within_ranges", lambda problem, x, deviation: deviation)
+    monkeypatch.setattr("lyapnet.training.examples._within_ranges", lambda problem, x, deviation: deviation)
     p = draw_examples(problem, optimum, torch.Generator().manual_seed(0)).x[:, 2]
     assert not bool(((low <= p) & (p <= high)).all()), "there are such deviations"
 

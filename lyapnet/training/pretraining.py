@@ -47,8 +47,8 @@ MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
 PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
-FAR_PATIENCE = 4  # the same while the best law so far is far from the optima
-FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while it is
+FAR_PATIENCE = 4  # the same while the cost of the best law so far is far above that of the optima
+FAR_STEPS_FACTOR = 4  # factor of the steps of a round meanwhile
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
@@ -63,8 +63,8 @@ class Method(NamedTuple):
     optimizer: Callable[..., torch.optim.Optimizer]
     steps: tuple[int, int]  # of the first fit, and of a round
     rate: tuple[float, float]  # largest learning rate of each
-    rounds: int  # at most
-    far_cost_ratio: float  # cost of the best law so far, relative to the optima, above which the law counts as far
+    rounds: int  # largest number of rounds after the first fit
+    far_cost_ratio: float  # cost of the best law so far, relative to the optima, above which it is far above them
 
 
 # With limits or other costs of controls, or limits of states, V_x has kinks. There a V fitted by Muon is accurate along
@@ -74,7 +74,7 @@ WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005), rounds=8, far
 
 
 def method_for(problem: Problem) -> Method:
-    """The optimizer for the fit to optima of a problem."""
+    """How V is fitted to optima of a problem."""
     return SMOOTH if problem.has_linear_law and problem.constraints is None else WITH_KINKS
 
 
@@ -203,7 +203,7 @@ def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Ten
 
 
 def _reference_controls_are_best(problem: Problem, ahead: bool) -> Sequence[bool]:
-    """For each row of a state, whether its reference control is the best control or the control at rest.
+    """The reference controls of a state's rows: True for the best control, False for the control at rest.
 
     The lookahead law searches from the control at rest to the best one, so V has to be accurate at both. With
     constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one
@@ -395,7 +395,7 @@ def fit(
     is_far, rounds_without_gain, last_start = False, 0, math.inf
     for k in range(method.rounds + 1):
         phase = min(k, 1)  # the first fit, or a further round
-        where = f" where its law leads ({k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
+        where = f" where its law leads (round {k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
         stage = f"fitting V to {len(optimum.path.cost)} optima{where} within {FIT_SECONDS[phase]:.0f} s of work"
         steps = method.steps[phase] * (FAR_STEPS_FACTOR if is_far else 1)
         fitting.lower(examples, steps, method.rate[phase], FIT_SECONDS[phase], partial(report, stage))

@@ -103,8 +103,8 @@ def class_of(options: Any, part: str) -> Any:
     if unread := _unread_settings(options, part):
         keys = ", ".join(f"{part}.{key}" for key in unread)
         raise UsageError(
-            f"Expected no {keys} with {part}.name={options.name}, which does not read them; remove them, or choose "
-            f"another {part}.name."
+            f"Expected no {keys} with {part}.name={options.name}, got values, which it does not read; remove them, or "
+            f"choose another {part}.name."
         )
     return class_of_equations(options) if cls is EquationSystem else cls
 

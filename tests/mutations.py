@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("folders", nargs="*", default=FOLDERS)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=1, help="number of the first one to try, to go on with the others")
+    parser.add_argument("--first", type=int, default=1, help="number of the first mutation to try")
     given = parser.parse_args()
     files = [path for folder in given.folders for path in sorted((ROOT / "lyapnet" / folder).rglob("*.py"))]
     each = [list(mutations(path.read_text(encoding="utf-8"), str(path.relative_to(ROOT)))) for path in files]
@@ -127,7 +127,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "lyapnet"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "logs", "__pycache__", ".venv", "dist"))
-        tried = list(enumerate(drawn, 1))[given.first - 1 :]
+        tried = [(number, mutation) for number, mutation in enumerate(drawn, 1) if number >= given.first]
         groups = sorted({tests_of(mutation.file) for _, mutation in tried})
         seconds = {tests: baseline(tests, copy) for tests in groups}
         for number, mutation in tried:

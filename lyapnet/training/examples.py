@@ -184,7 +184,7 @@ def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Ten
 
 
 def _reference_controls_are_best(problem: Problem, ahead: bool) -> Sequence[bool]:
-    """For each row of a state, whether its reference control is the best control or the control at rest.
+    """The reference controls of a state's rows: True for the best control, False for the control at rest.
 
     The lookahead law searches from the control at rest to the best one, so V has to be accurate at both. With
     constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one

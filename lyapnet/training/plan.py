@@ -15,7 +15,7 @@ from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.sizes import check_training_sizes
 from lyapnet.base.threads import use_threads
 from lyapnet.controller.loading import config_of, load_value_function, require_parts
-from lyapnet.experiment.assembly import REGISTRIES, Parts, parts_of
+from lyapnet.experiment.assembly import REGISTRIES, Parts, parts_of, without_unread_settings
 from lyapnet.experiment.assembly.target import named_entries
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint
 from lyapnet.experiment.config import Config, differing_keys, load_config
@@ -210,7 +210,8 @@ def _require_own_classes(given: Config, parts: Parts, config: Config, checkpoint
 
 
 def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:
-    changed = [key for key in differing_keys(config, stored) if not key.startswith(CHANGEABLE_ON_RESUME)]
+    read = without_unread_settings(config), without_unread_settings(stored)
+    changed = [key for key in differing_keys(*read) if not key.startswith(CHANGEABLE_ON_RESUME)]
     if {config.training.threads, stored.training.threads} == {None, 1}:  # torch computes on one thread in both
         changed.remove("training.threads")
     if [*config.family] != [*stored.family]:

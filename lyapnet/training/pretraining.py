@@ -43,8 +43,8 @@ MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
 ROUNDS_SECONDS = 120.0  # seconds of work after the first fit, after which no further round begins
 SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
 PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
-FAR_PATIENCE = 4  # the same while the best law so far is far from the optima
-FAR_STEPS_FACTOR = 4  # a round takes this many times as many steps while it is
+FAR_PATIENCE = 4  # the same while the cost of the best law so far is far above that of the optima
+FAR_STEPS_FACTOR = 4  # factor of the steps of a round meanwhile
 POOR_COST_RATIO = 1.05  # median cost relative to the optima above which another law is asked for
 VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
 MAX_WIDENED_EXCESS = 0.05  # excess cost of a law up to which V is also fitted where it leads on other plants
@@ -62,8 +62,8 @@ class Method(NamedTuple):
     optimizer: Callable[..., torch.optim.Optimizer]
     steps: tuple[int, int]  # of the first fit, and of a round
     rate: tuple[float, float]  # largest learning rate of each
-    rounds: int  # at most
-    far_cost_ratio: float  # cost of the best law so far, relative to the optima, above which the law counts as far
+    rounds: int  # largest number of rounds after the first fit
+    far_cost_ratio: float  # cost of the best law so far, relative to the optima, above which it is far above them
 
 
 # With limits or other costs of controls, or limits of states, V_x has kinks. There a V fitted by Muon is accurate along
@@ -73,7 +73,7 @@ WITH_KINKS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005), rounds=8, far
 
 
 def method_for(problem: Problem) -> Method:
-    """The optimizer for the fit to optima of a problem."""
+    """How V is fitted to optima of a problem."""
     return SMOOTH if problem.has_linear_law and problem.constraints is None else WITH_KINKS
 
 
@@ -171,7 +171,7 @@ def fit(
     is_far, rounds_without_gain, last_start = False, 0, math.inf
     for k in range(method.rounds + 1):
         phase = min(k, 1)  # the first fit, or a further round
-        where = f" where its law leads ({k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
+        where = f" where its law leads (round {k} of at most {method.rounds} in {ROUNDS_SECONDS:.0f} s)" if k else ""
         stage = f"fitting V to {len(optimum.path.cost)} optima{where} within {FIT_SECONDS[phase]:.0f} s of work"
         steps = method.steps[phase] * (FAR_STEPS_FACTOR if is_far else 1)
         fitting.lower(examples, steps, method.rate[phase], FIT_SECONDS[phase], partial(report, stage))
@@ -233,7 +233,7 @@ def _fit_on_other_plants(
         new += later_examples(learner, optimum, path, rest, generator, searching)
         examples = examples.concatenated_with(visited, *new)
         before = copy.deepcopy(learner.V.state_dict())
-        stage = f"fitting V where its law leads on other plants ({k + 1} of at most {DISTURBED_ROUNDS})"
+        stage = f"fitting V where its law leads on other plants (round {k + 1} of at most {DISTURBED_ROUNDS})"
         steps = DISTURBED_STEPS_FACTOR * fitting.method.steps[0]
         fitting.lower(examples, steps, fitting.method.rate[1], FIT_SECONDS[1], partial(report, stage))
         cost = learner.path_from(optimum.path.x[0]).cost

@@ -15,7 +15,7 @@ from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.controller.loading import require_parts
-from lyapnet.experiment.assembly import Parts, build_program
+from lyapnet.experiment.assembly import Parts, build_program, without_unread_settings
 from lyapnet.experiment.config import Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.prover.counterexamples import violations
 from lyapnet.training.experiment import train
@@ -112,7 +112,8 @@ def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], par
     pointwise["weight"] = pointwise["weight"] or program.pointwise or config["program"]["constraint"]
     pointwise["region"] = pointwise["region"] or _extent(certificate)
     config["training"]["learning_rate"] /= 5
-    write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())
+    resolved = without_unread_settings(config_from_plain(config, overrides))
+    write_atomically(folder / CONFIG, to_yaml(resolved).encode())
 
 
 def _train(folder: Path, checkpoint: Path, overrides: Sequence[str], console: Console, parts: Parts) -> TrainingRun:

@@ -397,17 +397,29 @@ def test_parts_from_python_are_trained_with(run):
     class Heavy(lyapnet.task.systems.DoubleIntegrator):
         pass
 
+    class Price(lyapnet.Cost):
+        def state(self, x):
+            return (x**2).sum(-1)
+
+        def R(self, x):
+            return torch.ones_like(x[..., :1, None])
+
+        def terminal(self, x):
+            return (x**2).sum(-1)
+
     rewrite(best(run), system={"name": "trap:Cart", "parameters": {}})
-    system = Heavy(mass=2.0)
+    system, cost = Heavy(mass=2.0), Price()
 
     def certified(checkpoint):
-        return claimed(checkpoint, controller=lyapnet.load(checkpoint, system=system))
+        return claimed(checkpoint, controller=lyapnet.load(checkpoint, system=system, cost=cost))
 
     with pytest.raises(UsageError, match="trap:Cart"):
         refinement.refine(best(run), certified, 1, FEW, Console(quiet=True))
     assert not list(run.glob("refine_*"))
-    checkpoint, _ = refinement.refine(best(run), certified, 1, FEW, Console(quiet=True), Parts(system=system))
-    assert load_config(run / "refine_1/config.yaml").system.name.endswith("Heavy")
+    checkpoint, _ = refinement.refine(best(run), certified, 1, FEW, Console(quiet=True), Parts(system, cost))
+    config = load_config(run / "refine_1/config.yaml")
+    assert config.system.name.endswith("Heavy")
+    assert config.cost.Q is None, "which no Price reads"
     with pytest.raises(UsageError, match="Heavy"):
         lyapnet.load(checkpoint)
 

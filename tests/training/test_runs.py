@@ -455,6 +455,15 @@ def test_a_run_of_one_thread_goes_on_with_programs_on_all_cores(then, now, same)
         plan._require_same_experiment(given, stored, Path("last.ckpt"))
 
 
+@pytest.mark.parametrize(("name", "same"), [("own:Price", True), ("quadratic", False)])
+def test_a_run_goes_on_whatever_is_written_in_settings_that_are_not_read(name, same):
+    """Such as cost.Q beside a cost that was passed as an object."""
+    task = str(ROOT / "conf" / "double_integrator.yaml")
+    given, stored = (load_config(task, [f"cost.name={name}", f"cost.Q={Q}"]) for Q in ("[1, 1]", "null"))
+    with contextlib.nullcontext() if same else pytest.raises(UsageError, match=r"got another cost\.Q"):
+        plan._require_same_experiment(given, stored, Path("last.ckpt"))
+
+
 def test_resuming_another_config_is_refused_before_the_first_checkpoint_too(desk):
     survives(desk, [(dies_at, MODULE, "training_step", 2)])
     status, _, message = desk.train("--resume", "last", "program.margin=0.2", prepare=without_figures)

@@ -16,7 +16,7 @@ from lyapnet.claims.tubes.tube import ProvedTube
 from lyapnet.controller.controller import Controller
 
 SHOWN = 12  # number of simulated closed loops in the figure
-OfFirstStates = Float[Tensor, " first"]  # a number for each of the first of some states
+OfFirstStates = Float[Tensor, " first"]  # one number for each of the first few states
 
 
 def tube(

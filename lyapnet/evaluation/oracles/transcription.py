@@ -40,8 +40,8 @@ BRIEF_ITERATIONS = 40, 150  # smallest and largest limit of iterations, if a min
 BRIEF_FACTOR = 3  # this limit, relative to the iterations of a first minimum
 MIN_SPREAD = 0.5  # share of the widths of X₀ over which explored states must extend
 _SINGLE_MINIMUM_TASKS = set[tuple[Any, ...]]()  # tasks with their X₀ that had one minimum from each explored state
-RANDOM_CURVE_STATES = 8  # first initial states that try random curves as initial guesses
-CURVES_PER_STATE = 2  # random curves for each of these states
+RANDOM_CURVE_STATES = 8  # first initial states that try random curves as initial guesses, at most
+CURVES_PER_STATE = 2  # random curves for each of these states; more if there are fewer, so that the total stays
 
 
 class Transcription(Oracle):
@@ -173,9 +173,9 @@ class Transcription(Oracle):
     ) -> Iterator[Iterator[Candidate]]:
         """The initial guesses of each pending state: known controls, and a line to the goal with the control at rest.
 
-        The first explored states, at most RANDOM_CURVE_STATES, also try random curves around that line, as many in all
-        however few they are; a better minimum from these is passed on to the other states. If nothing leads to a
-        minimum, the trial path is the last guess.
+        The first explored states, at most RANDOM_CURVE_STATES, also try random curves around that line: the fewer these
+        states, the more curves for each. A better minimum from these is passed on to the other states. If nothing leads
+        to a minimum, the trial path is the last guess.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()

@@ -100,15 +100,16 @@ def class_of(options: Any, part: str) -> Any:
     """
     registry, base = REGISTRIES[part]
     cls = resolve(options.name, registry, f"{part}.name", base)
-    if unread := unread_settings(options, part):
+    if unread := _unread_settings(options, part):
+        keys = ", ".join(f"{part}.{key}" for key in unread)
         raise UsageError(
-            f"Expected no {part}.{unread[0]} with {part}.name={options.name}, got one; remove it, or choose another "
-            f"{part}.name."
+            f"Expected no {keys} with {part}.name={options.name}, got values, which it does not read; remove them, or "
+            f"choose another {part}.name."
         )
     return class_of_equations(options) if cls is EquationSystem else cls
 
 
-def unread_settings(options: Any, part: str) -> list[str]:
+def _unread_settings(options: Any, part: str) -> list[str]:
     """The keys of the settings that a section has, but the class that it names does not read."""
     reader, keys = SETTINGS_OF_ONE_CLASS.get(part, (None, ()))
     if REGISTRIES[part][0].get(options.name) is reader:
@@ -116,15 +117,17 @@ def unread_settings(options: Any, part: str) -> list[str]:
     return [key for key in keys if getattr(options, key) not in (None, "", [], {})]
 
 
+def section_without_unread_settings(options: Any, part: str) -> Any:
+    """A section of a config without the settings that `class_of` refuses."""
+    defaults = type(options)()
+    return replace(options, **{key: getattr(defaults, key) for key in _unread_settings(options, part)})
+
+
 def without_unread_settings(config: Config) -> Config:
-    """A config without the settings that 0.3 ignored and `class_of` refuses."""
+    """A config without the settings that `class_of` refuses; 0.3 ignored them."""
     sections = {part: getattr(config, part) for part in SETTINGS_OF_ONE_CLASS}
     return replace(
-        config,
-        **{
-            part: replace(options, **{key: getattr(type(options)(), key) for key in unread_settings(options, part)})
-            for part, options in sections.items()
-        },
+        config, **{part: section_without_unread_settings(options, part) for part, options in sections.items()}
     )
 
 

@@ -2,9 +2,16 @@
 
 import copy
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
-from lyapnet.experiment.assembly.classes import Parts, class_of, instance_of, own_parts
+from lyapnet.experiment.assembly.classes import (
+    Parts,
+    class_of,
+    instance_of,
+    own_parts,
+    section_without_unread_settings,
+)
 from lyapnet.experiment.assembly.learner import build_program, program_options
 from lyapnet.experiment.assembly.problem import build_cost, build_system, refuse_two_sets
 from lyapnet.experiment.config import Config
@@ -21,10 +28,15 @@ def parts_of(config: Config) -> Parts:
 
 
 def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
-    """Import parts by section and class name, with the other options of a config; see parts_of."""
+    """Import parts by section and class name, with the other options of a config; see parts_of.
+
+    What only the class that is replaced would read, such as cost.Q, is left out.
+    """
     config = copy.deepcopy(config)
     for part, name in names.items():
-        getattr(config, part).name = name
+        options = getattr(config, part)
+        if options.name != name:
+            setattr(config, part, section_without_unread_settings(replace(options, name=name), part))
     builders: dict[str, Callable[[], Any]] = {
         "system": lambda: build_system(config.system),
         "cost": lambda: build_cost(config.cost),

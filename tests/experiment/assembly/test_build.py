@@ -13,7 +13,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims.preconditions import over_time
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import resolve
-from lyapnet.experiment.assembly.named_parts import python_expression
+from lyapnet.experiment.assembly.named_parts import parts_named, python_expression
 from lyapnet.experiment.config import config_from_plain, load_config, to_plain
 from lyapnet.loop.programs import LyapunovProgram, RegionProgram, ValueProgram
 from lyapnet.prover.bounds import BoundedFunction
@@ -292,6 +292,14 @@ def test_classes_of_the_users_own_are_built(name, mass, own_classes, plain):
     assert problem.system.mass == mass
     assert V.width == 6
     assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / mass)  # −½ R⁻¹gᵀV_x with V = ‖x‖²
+
+
+def test_a_class_in_the_place_of_another_reads_no_settings_of_that(own_classes, plain):
+    plain["system"] = {"name": "equations", "equations": "der(a) = 0", "states": {"a": "m"}}
+    config = config_from_plain(plain)
+    parts = parts_named(config, {"cost": f"{own_classes}:Price", "system": f"{own_classes}:Balloon"})
+    assert (type(parts.cost).__name__, type(parts.system).__name__) == ("Price", "Balloon")
+    assert config == config_from_plain(plain), "and the config stays as it is"
 
 
 @pytest.mark.parametrize("name", ["maglev", "json", "maglev:"])

@@ -50,7 +50,8 @@ def path_of(problem: Problem, x: StatePath, u: ControlPath, running_cost: PerSta
 
     Its cost is infinite if it is not finite, leaves the domain, or jumps over a pole of f, g, q or φ.
     """
-    J, x = (running_cost + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf), x.nan_to_num()
+    J = running_cost + problem.cost.terminal(x[-1])
+    J, x = J.where(J.isfinite(), torch.inf), x.nan_to_num()
     if (poles := _poles_of(problem)) is not None:
         J = J.masked_fill(poles.crossed(x.double().cpu()).to(J.device), torch.inf)
     if problem.domain is not None:

@@ -237,3 +237,13 @@ def test_controls_that_differ_in_a_number_have_programs_of_their_own():
         found = StepPrograms(limited, SIZES).search(x, 10 * u, k, K)[1]
         assert float(found.abs().max()) == radius
     assert len(problem.findings.programs) == 2
+
+
+@pytest.mark.parametrize("end", [-torch.inf, torch.inf, torch.nan])
+def test_a_path_without_a_finite_cost_costs_infinitely_much(end):
+    """Also where costs may be negative."""
+    problem = swinging()
+    x, u, _, _ = law_along(problem, 2)
+    cost = path_of(problem, x, u, torch.tensor([1.0, end])).cost
+    assert cost.isfinite().tolist() == [True, False]
+    assert cost[1] == torch.inf

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
+from lyapnet.base.types import Control, PerState, State
 from lyapnet.task.problem import Problem
 from lyapnet.training.learner import Learner
-from lyapnet.value.expansions import Path, in_float64, path_of
+from lyapnet.value.expansions import Path, in_float64, path_under
 
 RATE_CHANGE = 0.3  # largest relative change of the rate ẋ_i of a state, without control and by control
 TEST_POINTS = 1000  # points of a path at which it is seen which rates every plant has, about
@@ -34,15 +35,12 @@ def disturbed_path(learner: Learner, optimal: Path, generator: torch.Generator) 
     outwards = DISTANCE * draw(x[:, :1]) * (x - problem.initial_states.center.to(x))
     outwards[:, constants] = 0
     drift, response = (1 + RATE_CHANGE * (2 * draw(x) - 1) * varies for _ in range(2))
-    states, controls, J = [x + outwards], list[Tensor](), torch.zeros_like(x[:, 0])
-    for t in times[:-1]:
-        now = states[-1]
-        u = policy(t, now.to(goal)).to(x)
-        (following, paid), (at_rest, _) = problem.step(now, u), problem.step(now, problem.rest_at(now))
-        states.append(now + drift * (at_rest - now) + response * (following - at_rest))
-        controls.append(u)
-        J = J + paid
-    return path_of(problem, torch.stack(states), torch.stack(controls), J)
+
+    def step(x: State, u: Control) -> tuple[State, PerState]:
+        (following, paid), (at_rest, _) = problem.step(x, u), problem.step(x, problem.rest_at(x))
+        return x + drift * (at_rest - x) + response * (following - at_rest), paid
+
+    return path_under(problem, lambda n, x: policy(times[n], x.to(goal)).to(x), x + outwards, step=step)
 
 
 def rate_is_certain(problem: Problem, path: Path) -> Tensor:

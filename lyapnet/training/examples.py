@@ -132,9 +132,12 @@ def unknown_states(
     """
     N, loops = problem.horizon.steps, torch.nonzero(chosen).flatten()
     loops = loops[torch.randperm(len(loops), generator=generator)[:MAX_LATER_OPTIMA]]
-    deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    is_known = _trusted_share(problem, optimum, deviation, TRUST_LIMIT) >= 1
-    return {k: loops[~is_known[k, loops]] for k in sorted({round(share * N) for share in times} - {N})}
+    nodes = sorted({round(share * N) for share in times} - {N})
+    at = torch.tensor(nodes)[:, None], loops
+    deviation = path.x[at] - optimum.expansion.x[at]
+    scale = _error_scale(problem, optimum)[at]
+    is_known = _trusted_share(optimum.expansion.hessian[at], scale, deviation, TRUST_LIMIT) >= 1
+    return {k: loops[~known] for k, known in zip(nodes, is_known, strict=True)}
 
 
 def later_examples(
@@ -159,14 +162,15 @@ def later_examples(
 
 def _limit_deviations(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
     """Scale down deviations δ (N, b, n) for which ½ δᵀ|H|δ is more than a share of the cost."""
-    return _trusted_share(problem, optimum, deviation, share)[..., None] * deviation
+    hessian, scale = optimum.expansion.hessian[:-1], _error_scale(problem, optimum)
+    return _trusted_share(hessian, scale, deviation, share)[..., None] * deviation
 
 
-def _trusted_share(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> Tensor:
-    """The factor (N, b) ≤ 1 of deviations δ (N, b, n) with which ½ δᵀ|H|δ is at most a share of the cost."""
-    values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
+def _trusted_share(hessian: Tensor, scale: Tensor, deviation: StatePath, share: float) -> Tensor:
+    """The factor (N, b) ≤ 1 of deviations δ (N, b, n) with which ½ δᵀ|H|δ is at most a share of the scale of costs."""
+    values, vectors = torch.linalg.eigh(hessian)
     quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
-    ratio = share * _error_scale(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
+    ratio = share * scale / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
     return ratio.sqrt().clamp_max(1)
 
 

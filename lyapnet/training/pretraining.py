@@ -135,6 +135,12 @@ def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:
         return float(_Misfit(V, problem)(*some.to(next(V.parameters()))).nan_to_num(torch.inf))
 
 
+@torch.no_grad()
+def excess_at(V: ValueFunction, examples: Examples, problem: Problem) -> float:
+    """The mean relative excess cost of the law of V at some examples."""
+    return float(errors(V, examples.to(next(V.parameters())), problem)[1])
+
+
 def relative_misfit(V: ValueFunction, examples: Examples) -> float:
     """The mean of (log V − log V*)², for a V that is positive except at the goal."""
     like = next(V.parameters())
@@ -223,14 +229,13 @@ def _fit_on_other_plants(
     for k in range(DISTURBED_ROUNDS):
         path = disturbed_path(learner, optimum.path, generator)
         starts = unknown_states(problem, optimum, path, path.cost.isfinite(), DISTURBED_TIMES, generator)
-        few, rest = (
-            {k: rows[part] for k, rows in starts.items()} for part in (slice(TRIED_OPTIMA), slice(TRIED_OPTIMA, None))
-        )
+        few = {node: loops[:TRIED_OPTIMA] for node, loops in starts.items()}
+        others = {node: loops[TRIED_OPTIMA:] for node, loops in starts.items()}
         new = later_examples(learner, optimum, path, few, generator, searching)
-        if not new or fitting.excess_at(new[0].concatenated_with(*new[1:])) <= MAX_DISTURBED_EXCESS:
+        if not new or excess_at(learner.V, new[0].concatenated_with(*new[1:]), problem) <= MAX_DISTURBED_EXCESS:
             break
         visited = examples_visited(problem, optimum, path, looks_ahead(learner))
-        new += later_examples(learner, optimum, path, rest, generator, searching)
+        new += later_examples(learner, optimum, path, others, generator, searching)
         examples = examples.concatenated_with(visited, *new)
         before = copy.deepcopy(learner.V.state_dict())
         stage = f"fitting V where its law leads on other plants (round {k + 1} of at most {DISTURBED_ROUNDS})"
@@ -260,17 +265,11 @@ class _Fit:
     """
 
     def __init__(self, learner: Learner, examples: Examples, generator: torch.Generator):
-        self._V, self._problem = learner.V, learner.problem
         self._trained, self._generator = trained_of(learner.V), generator
         some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH_SIZE).long()])
         loss = _Misfit(learner.V, learner.problem)
         self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
         self.method = method_for(learner.problem)
-
-    @torch.no_grad()
-    def excess_at(self, examples: Examples) -> float:
-        """The mean relative excess cost of the law of V at some examples."""
-        return float(errors(self._V, examples.to(self._trained[0]), self._problem)[1])
 
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]

@@ -4,21 +4,17 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.loop.programs import ValueProgram
-from lyapnet.loop.rollout import Rollout
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Cartpole, ControlSystem, DoubleIntegrator, KinematicBicycle, Linear
 from lyapnet.training import disturbed_loops, examples, pretraining
 from lyapnet.training.disturbed_loops import disturbed_path, rate_is_certain
 from lyapnet.training.examples import draw_examples
-from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
 from lyapnet.training.pretraining import fit
 from lyapnet.value.expansions import optimal_trajectories, path_under
-from lyapnet.value.networks import FCN, Scaling
-from lyapnet.value.policy import SampledPolicy
 from tests.fits import shorten_fits
 from tests.problems import problem_of
+from tests.training.test_pretraining import learner_of
 from tests.value.expansions.test_expansions import hanging
 
 
@@ -29,11 +25,6 @@ class WithClock(ControlSystem):
 
     def dynamics(self, x, u):
         return torch.stack([x[..., 1], torch.sin(x[..., 0]) + u[..., 0] ** 3, torch.ones_like(x[..., 0])], -1)
-
-
-def learner_of(problem):
-    V = FCN(Scaling((1.0,) * problem.system.n, problem.horizon.duration, 1.0), (16, 16))
-    return Learner(problem, V, Rollout(problem, SampledPolicy(problem, V), gradient="discrete"), ValueProgram())
 
 
 def pushed(problem, generator, count=40):
@@ -104,8 +95,7 @@ def test_a_fit_to_where_they_lead_makes_the_law_better_there_and_no_worse_on_the
     for rounds in (0, 3):
         torch.manual_seed(0)
         monkeypatch.setattr(pretraining, "DISTURBED_ROUNDS", rounds)
-        V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, float(optimum.path.cost.mean())), (32, 32))
-        learner = Learner(problem, V, Rollout(problem, SampledPolicy(problem, V), gradient="discrete"), ValueProgram())
+        learner = learner_of(problem, float(optimum.path.cost.mean()))
         fit(learner, optimum, draw_examples(problem, optimum, torch.Generator().manual_seed(0)))
         with monkeypatch.context() as patch:
             patch.setattr(disturbed_loops, "DISTANCE", 1.0)

@@ -135,8 +135,8 @@ def swing(optima, monkeypatch):
     return optima
 
 
-def learner_of(problem, value_scale):
-    V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, value_scale), (32, 32))
+def learner_of(problem, value_scale=1.0):
+    V = FCN(Scaling((3.0,) * problem.system.n, problem.horizon.duration, value_scale), (32, 32))
     return Learner(problem, V, Rollout(problem, SampledPolicy(problem, V), gradient="discrete"), ValueProgram())
 
 

@@ -397,18 +397,11 @@ def test_parts_from_python_are_trained_with(run):
     class Heavy(lyapnet.task.systems.DoubleIntegrator):
         pass
 
-    class Price(lyapnet.Cost):
-        def state(self, x):
-            return (x**2).sum(-1)
-
-        def R(self, x):
-            return torch.ones_like(x[..., :1, None])
-
-        def terminal(self, x):
-            return (x**2).sum(-1)
+    class Price(lyapnet.QuadraticCost):
+        pass
 
     rewrite(best(run), system={"name": "trap:Cart", "parameters": {}})
-    system, cost = Heavy(mass=2.0), Price()
+    system, cost = Heavy(mass=2.0), Price(torch.eye(2), torch.eye(1), torch.eye(2))
 
     def certified(checkpoint):
         return claimed(checkpoint, controller=lyapnet.load(checkpoint, system=system, cost=cost))

@@ -27,17 +27,23 @@ class Path(NamedTuple):
 
 @torch.no_grad()
 def path_under(
-    problem: Problem, law: Callable[[int, State], Control], x0: State, increments: Increments | None = None
+    problem: Problem,
+    law: Callable[[int, State], Control],
+    x0: State,
+    increments: Increments | None = None,
+    step: Callable[[State, Control], tuple[State, PerState]] | None = None,
 ) -> Path:
     """The closed loops of a law (n, x_n) ↦ u_n from a batch of states; they may diverge.
 
     Args:
         increments: ΔW of each step; None: without noise.
+        step: (x, u) ↦ (x⁺, ∫ℓ dt) of a plant that differs from the model; None: the step of the problem.
     """
+    step = step or problem.step
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
-        following, paid = problem.step(x[-1], u[-1])
+        following, paid = step(x[-1], u[-1])
         if increments is not None and problem.noise is not None:
             following = following + problem.noise.displacement(x[-1], increments[n])
         x.append(following)
